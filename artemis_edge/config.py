@@ -1,0 +1,108 @@
+"""Every parameter of the system: declared once, with its unit, range and reason.
+
+A profile (``artemis_edge/profiles/*.toml``) or a user's file overrides defaults, ``--set section.field=value``
+overrides both, and the effective values are written beside the results as ``config.toml``.
+``docs/tuning.md`` lists these descriptions.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import tomli_w
+from msgspec import Meta, Struct
+
+from artemis_edge.errors import InputError
+
+
+def _float(text: str, *, ge: float | None = None, gt: float | None = None, le: float | None = None) -> Meta:
+    return Meta(description=text, ge=ge, gt=gt, le=le)
+
+
+class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """LiDAR odometry, used when no poses are given (section III-A of the paper, odometry/)."""
+
+
+class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """Voxel grid that scans are allocated to (section III-B, voxel_map.py)."""
+
+
+class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """Incremental meshing of active voxels (section III-B, mesher.py)."""
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole configuration: one section a stage."""
+
+    odometry: OdometryConfig = OdometryConfig()
+    voxel_map: VoxelMapConfig = VoxelMapConfig()
+    mesher: MesherConfig = MesherConfig()
+
+
+def load(file: Path | None = None, profile: str | None = None, sets: Iterable[str] = ()) -> Config:
+    """Effective configuration: defaults, then the profile, then the file, then ``section.field=value`` texts.
+
+    Raises InputError naming the field and what it accepts.
+    """
+    tree: dict[str, Any] = {}
+    if profile is not None:
+        _merge(tree, _read_profile(profile))
+    if file is not None:
+        _merge(tree, _read_toml(file))
+    for text in sets:
+        _merge(tree, _parse_set(text))
+    try:
+        return msgspec.convert(tree, Config)
+    except msgspec.ValidationError as error:
+        raise InputError(f"configuration: {error}; docs/tuning.md lists every field and its range") from None
+
+
+def to_toml(config: Config) -> str:
+    """The effective configuration as TOML text."""
+    return tomli_w.dumps(msgspec.to_builtins(config))
+
+
+def profiles() -> list[str]:
+    """Names of the profiles that ship with the program."""
+    folder = resources.files("artemis_edge") / "profiles"
+    return sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml"))
+
+
+def _read_profile(name: str) -> dict[str, Any]:
+    if name not in profiles():
+        raise InputError(f"no profile named '{name}'; there are: {', '.join(profiles()) or 'none'}")
+    return tomllib.loads((resources.files("artemis_edge") / "profiles" / f"{name}.toml").read_text())
+
+
+def _read_toml(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text())
+    except OSError as error:
+        raise InputError(f"cannot read configuration {file}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file} is not valid TOML: {error}") from None
+
+
+def _parse_set(text: str) -> dict[str, Any]:
+    key, equals, value = text.partition("=")
+    section, dot, field = key.strip().partition(".")
+    if not (equals and dot and section and field):
+        raise InputError(f"--set {text}: write it as section.field=value, for example voxel_map.voxel_m=0.4")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value
+    return {section: {field: parsed}}
+
+
+def _merge(into: dict[str, Any], other: dict[str, Any]) -> None:
+    for key, value in other.items():
+        if isinstance(value, dict) and isinstance(into.get(key), dict):
+            _merge(into[key], value)
+        else:
+            into[key] = value

@@ -1,0 +1,14 @@
+"""The one place where the flags of compiled kernels are set (used by both packages).
+
+``nogil`` lets the capture side run while a kernel works; ``error_model="numpy"`` makes division by zero
+give inf as numpy does instead of a branch; no ``fastmath``, because equal input must give an equal map.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numba
+
+njit = partial(numba.njit, cache=True, nogil=True, error_model="numpy")
+inline = partial(numba.njit, cache=True, nogil=True, error_model="numpy", inline="always")
