@@ -1,0 +1,38 @@
+"""Files that are either complete or not there: written beside their place, then renamed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from artemis_edge.errors import RunError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Binary file to write to, which takes the place of ``path`` only when the block ends without an error.
+
+    Raises RunError naming the cause (full disk, no permission); an older file of that name is then untouched.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise RunError(
+            f"cannot write {path}: {error.strerror or error}; free space or choose another place"
+        ) from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a whole file at once; raises RunError as :func:`replacing` does."""
+    with replacing(path) as file:
+        file.write(content)

@@ -1,0 +1,172 @@
+"""PLY files: what is written is read back, and foreign or broken files are handled."""
+
+import errno
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from artemis_edge.errors import InputError, RunError
+from artemis_edge.export import ply
+from artemis_edge.export.ply import Mesh, PointCloud, bare_mesh, read_ply, write_ply
+
+
+def coloured_sphere() -> Mesh:
+    sphere = trimesh.creation.icosphere(2)
+    rng = np.random.default_rng(3)
+    n = len(sphere.vertices)
+    return bare_mesh(
+        sphere.vertices,
+        sphere.faces,
+        colours=rng.integers(0, 256, (n, 3), dtype=np.uint8),
+        labels=rng.integers(0, 4, n, dtype=np.uint8),
+        confidence=rng.random(n, dtype=np.float32),
+        label_names={0: "background", 3: "red car"},
+    )
+
+
+def assert_same(a: Mesh, b: Mesh) -> None:
+    for name in ("vertices", "normals", "colours", "labels", "confidence", "faces"):
+        left, right = getattr(a, name), getattr(b, name)
+        assert left.dtype == right.dtype, name
+        np.testing.assert_array_equal(left, right, err_msg=name)
+    assert a.label_names == b.label_names
+
+
+def test_ply_round_trip(tmp_path: Path) -> None:
+    mesh = coloured_sphere()
+    write_ply(tmp_path / "mesh.ply", mesh)
+    back = read_ply(tmp_path / "mesh.ply")
+    assert isinstance(back, Mesh)
+    assert_same(mesh, back)
+
+
+def test_ply_header_is_the_contract(tmp_path: Path) -> None:
+    write_ply(tmp_path / "mesh.ply", coloured_sphere())
+    header = (tmp_path / "mesh.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert "comment label 3 red car" in header
+    properties = [line.split()[1:] for line in header if line.startswith("property")]
+    assert properties == [
+        *(["float", n] for n in ("x", "y", "z", "nx", "ny", "nz")),
+        *(["uchar", n] for n in ("red", "green", "blue", "label")),
+        ["float", "confidence"],
+        ["list", "uchar", "int", "vertex_indices"],
+    ]
+
+
+def test_ply_is_deterministic_and_opens_elsewhere(tmp_path: Path) -> None:
+    mesh = coloured_sphere()
+    write_ply(tmp_path / "a.ply", mesh)
+    write_ply(tmp_path / "b.ply", mesh)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    other = trimesh.load(tmp_path / "a.ply", process=False)
+    assert (len(other.vertices), len(other.faces)) == (len(mesh.vertices), len(mesh.faces))
+    assert other.is_watertight
+    np.testing.assert_array_equal(other.visual.vertex_colors[:, :3], mesh.colours)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_ply_of_another_writer(tmp_path: Path, encoding: str) -> None:
+    sphere = trimesh.creation.icosphere(2)
+    sphere.export(tmp_path / "m.ply", encoding=encoding)
+    mesh = read_ply(tmp_path / "m.ply")
+    assert isinstance(mesh, Mesh)
+    np.testing.assert_allclose(mesh.vertices, sphere.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, sphere.faces)
+
+
+def test_big_endian_doubles_in_another_order(tmp_path: Path) -> None:
+    row = np.dtype(
+        [("label", "u1"), ("z", ">f8"), ("y", ">f8"), ("x", ">f8"), ("r", ">f4"), ("g", ">f4"), ("b", ">f4")]
+    )
+    rows = np.zeros(5, row)
+    rows["x"], rows["y"], rows["z"], rows["label"], rows["g"] = 1.5, np.arange(5), -3, 255, 1.0
+    header = "ply\r\nformat binary_big_endian 1.0\r\nelement vertex 5\r\nproperty uchar label\r\n"
+    header += "".join(f"property double {axis}\r\n" for axis in "zyx")
+    header += "".join(f"property float {c}\r\n" for c in "rgb") + "comment label 2 big tree\r\nend_header\r\n"
+    (tmp_path / "c.ply").write_bytes(header.encode() + rows.tobytes())
+    cloud = read_ply(tmp_path / "c.ply")
+    assert isinstance(cloud, PointCloud)
+    np.testing.assert_array_equal(cloud.points, np.stack([np.full(5, 1.5), np.arange(5), np.full(5, -3)], 1))
+    assert cloud.labels is not None and cloud.labels.tolist() == [255] * 5
+    assert cloud.colours is not None and cloud.colours.tolist() == [[0, 255, 0]] * 5
+    assert cloud.label_names == {2: "big tree"}
+
+
+ONE_POINT = b"ply\nformat ascii 1.0\nelement vertex 1\n\
+property float x\nproperty float y\nproperty float z\nend_header\n"
+QUADS = "ply\nformat {format} 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n\
+element face 2\nproperty list uchar int vertex_index\nend_header\n"
+
+
+@pytest.mark.parametrize("layout", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_mixed_polygons_become_fans(tmp_path: Path, layout: str) -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 2, 0]], np.float32)
+    faces = ([0, 1, 2, 3], [3, 2, 4])
+    if layout == "ascii":
+        body = b"\n".join(b" ".join(b"%g" % v for v in p) for p in points.tolist())
+        body += b"\n" + b"\n".join(b"%d " % len(f) + b" ".join(b"%d" % v for v in f) for f in faces)
+    else:
+        order = "<" if "little" in layout else ">"
+        body = points.astype(order + "f4").tobytes()
+        body += b"".join(bytes([len(f)]) + np.array(f, order + "i4").tobytes() for f in faces)
+    (tmp_path / "q.ply").write_bytes(QUADS.format(format=layout).encode() + body)
+    mesh = read_ply(tmp_path / "q.ply")
+    assert isinstance(mesh, Mesh)
+    np.testing.assert_array_equal(mesh.vertices, points)
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [3, 2, 4]]
+    np.testing.assert_array_equal(mesh.normals, np.tile(np.float32([0, 0, 1]), (5, 1)))
+
+
+@pytest.mark.parametrize("keep", [2, 40, 300, -1])
+def test_truncated_ply_says_so(tmp_path: Path, keep: int) -> None:
+    write_ply(tmp_path / "m.ply", coloured_sphere())
+    (tmp_path / "t.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:keep])
+    with pytest.raises(InputError, match=r"t\.ply is not a usable PLY file"):
+        read_ply(tmp_path / "t.ply")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"solid not a ply",
+        b"ply\nformat ascii 1.0\nelement vertex x\nend_header\n",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+        ONE_POINT + b"1 a 2",
+        QUADS.format(format="ascii").encode() + b"0 0 0 " * 5 + b"3 0 1 9 3 0 1 2",
+    ],
+)
+def test_not_a_ply_says_so(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "t.ply").write_bytes(content)
+    with pytest.raises(InputError, match=r"t\.ply is not a usable PLY file"):
+        read_ply(tmp_path / "t.ply")
+
+
+def test_missing_and_wrong_kind(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot read"):
+        read_ply(tmp_path / "absent.ply")
+    mesh = coloured_sphere()
+    write_ply(tmp_path / "empty.ply", bare_mesh(mesh.vertices[:0], mesh.faces[:0]))
+    empty = read_ply(tmp_path / "empty.ply")
+    assert isinstance(empty, Mesh) and len(empty.vertices) == 0
+    (tmp_path / "cloud.ply").write_bytes(ONE_POINT + b"1 2 3")
+    assert ply.read_points(tmp_path / "cloud.ply").points.tolist() == [[1, 2, 3]]
+    with pytest.raises(InputError, match="no triangles"):
+        ply.read_mesh(tmp_path / "cloud.ply")
+
+
+def test_full_disk_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "m.ply"
+    target.write_bytes(b"old")
+
+    def full(*_: object) -> bytes:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ply, "_face_rows", full)
+    with pytest.raises(RunError, match="No space left on device"):
+        write_ply(target, coloured_sphere())
+    assert [p.name for p in tmp_path.iterdir()] == ["m.ply"]
+    assert target.read_bytes() == b"old"
