@@ -1,0 +1,68 @@
+"""Poses that came with the input (``--poses``, tf, a data set): no estimation, only time and motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from artemis_edge.errors import InputError
+from artemis_edge.frames import F64, SyncedFrame, TrackedFrame, Trajectory
+from artemis_edge.odometry import se3
+from artemis_edge.odometry.deskew import deskew_frame
+
+# Stamps this close belong together (the tolerance of ``evaluate trajectory``): printed times are rounded.
+_PAIRING_NS = 10_000_000
+
+
+class GivenPoses:
+    """Odometry that looks poses up: exactly at a pose's stamp, between two poses by constant velocity.
+
+    The twist that corrects the motion within a scan is the central difference over the neighbouring poses;
+    with a single pose it is zero. Raises InputError if the poses are unordered or do not cover a frame.
+    """
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        stamps = np.ascontiguousarray(trajectory.stamp_ns, np.int64)
+        poses = np.asarray(trajectory.T_world_lidar, np.float64)
+        if len(stamps) == 0:
+            raise InputError(
+                "the given poses are empty; give a file with at least one pose or use --no-poses"
+            )
+        if poses.shape != (len(stamps), 4, 4) or not np.isfinite(poses).all():
+            raise InputError("the given poses are not finite 4 x 4 matrices, one a stamp; mend the pose file")
+        if (np.diff(stamps) <= 0).any():
+            raise InputError("the stamps of the given poses do not ascend; sort the pose file by time")
+        self._stamps = stamps
+        self._poses = np.stack([se3.orthonormal(np.ascontiguousarray(T)) for T in poses])
+
+    def track(self, frame: SyncedFrame) -> TrackedFrame:
+        """Pose at the frame's stamp and the points moved there; InputError if no pose covers it."""
+        T_world_lidar, twist = self.at(frame.stamp_ns)
+        scans = deskew_frame(frame, twist)
+        return TrackedFrame(frame.index, frame.stamp_ns, T_world_lidar, scans, images=frame.images)
+
+    def at(self, stamp_ns: int) -> tuple[F64, F64]:
+        """``T_world_lidar`` (4, 4) and the body twist (6,) (m/s, rad/s) at a stamp."""
+        first, last = int(self._stamps[0]), int(self._stamps[-1])
+        if not first - _PAIRING_NS <= stamp_ns <= last + _PAIRING_NS:
+            raise InputError(
+                f"no given pose covers the frame at {stamp_ns * 1e-9:.3f} s: the poses run from "
+                f"{first * 1e-9:.3f} to {last * 1e-9:.3f} s; limit the frames with --frames or give poses for all"
+            )
+        n = len(self._stamps)
+        right = int(np.searchsorted(self._stamps, stamp_ns))
+        near = min(
+            range(max(right - 1, 0), min(right + 1, n)), key=lambda k: abs(int(self._stamps[k]) - stamp_ns)
+        )
+        if self._stamps[near] == stamp_ns or not first < stamp_ns < last:
+            twist = self._twist(max(near - 1, 0), min(near + 1, n - 1))
+        else:
+            near, twist = right - 1, self._twist(right - 1, right)
+        elapsed_s = (stamp_ns - int(self._stamps[near])) * 1e-9
+        return self._poses[near] @ se3.exp(elapsed_s * twist), twist
+
+    def _twist(self, i: int, j: int) -> F64:
+        """Mean body twist between poses i and j; zero if they are the same."""
+        if i == j:
+            return np.zeros(6)
+        motion: F64 = se3.log(se3.inverse(self._poses[i]) @ self._poses[j])
+        return motion / (int(self._stamps[j] - self._stamps[i]) * 1e-9)
