@@ -1,1 +1,1 @@
-"""."""
+"""Measures of a map: its geometry, its trajectory."""
