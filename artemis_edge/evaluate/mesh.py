@@ -135,7 +135,8 @@ def evaluate_mesh(
 
 
 def _finite(points: F32) -> Bool:
-    return np.logical_and.reduce(np.isfinite(points), axis=1)
+    finite: Bool = np.logical_and.reduce(np.isfinite(points), axis=1)
+    return finite
 
 
 def _compare(vertices: F32, faces: I32, reference: F32, tau: float, crop: bool) -> Comparison:
