@@ -46,7 +46,7 @@ class GivenPoses:
         if not first - _PAIRING_NS <= stamp_ns <= last + _PAIRING_NS:
             raise InputError(
                 f"no given pose covers the frame at {stamp_ns * 1e-9:.3f} s: the poses run from "
-                f"{first * 1e-9:.3f} to {last * 1e-9:.3f} s; limit the frames with --frames or give poses for all"
+                f"{first * 1e-9:.3f} to {last * 1e-9:.3f} s; use --frames or give poses for all of them"
             )
         n = len(self._stamps)
         right = int(np.searchsorted(self._stamps, stamp_ns))
