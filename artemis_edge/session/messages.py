@@ -1,0 +1,389 @@
+"""The ROS 2 messages of a session as typed records, and their CDR encoding.
+
+``decode`` and ``encode`` are inverse. Arrays of a decoded message are read-only views of its bytes.
+Quaternions are (x, y, z, w), covariances row-major, stamps int64 nanoseconds. A malformed message raises
+CdrError.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from artemis_edge.frames import F64
+from artemis_edge.session.cdr import Buffer, CdrReader, CdrWriter
+
+_SECOND_NS = 1_000_000_000
+
+# sensor_msgs/PointField datatype -> numpy code
+FIELD_CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+FIELD_TYPES = {code: number for number, code in FIELD_CODES.items()}
+
+
+class Message(Protocol):
+    """A message that can stand in a session."""
+
+    ROS_TYPE: ClassVar[str]
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        ...
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Time and coordinate frame of a message."""
+
+    stamp_ns: int
+    frame_id: str
+
+    @classmethod
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
+        seconds, nanoseconds = cdr.read("i"), cdr.read("I")
+        return cls(seconds * _SECOND_NS + nanoseconds, cdr.string())
+
+    def write(self, cdr: CdrWriter) -> None:
+        """To the position of a writer."""
+        seconds, nanoseconds = divmod(self.stamp_ns, _SECOND_NS)
+        cdr.write("i", seconds)
+        cdr.write("I", nanoseconds)
+        cdr.string(self.frame_id)
+
+
+def peek_header(data: Buffer) -> Header:
+    """Header of a message that starts with one; the rest of the message need not be there."""
+    return Header.read(CdrReader(data))
+
+
+@dataclass(frozen=True, slots=True)
+class PointField:
+    """One field of a point: ``datatype`` is a key of FIELD_CODES, ``offset`` bytes from the point's start."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PointCloud2:
+    """sensor_msgs/msg/PointCloud2: ``data`` holds ``height`` rows of ``row_step`` bytes."""
+
+    ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/PointCloud2"
+    header: Header
+    height: int
+    width: int
+    fields: tuple[PointField, ...]
+    point_step: int
+    row_step: int
+    data: Buffer
+    is_bigendian: bool = False
+    is_dense: bool = True
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.write("I", self.height)
+        cdr.write("I", self.width)
+        cdr.write("I", len(self.fields))
+        for item in self.fields:
+            cdr.string(item.name)
+            cdr.write("I", item.offset)
+            cdr.write("B", item.datatype)
+            cdr.write("I", item.count)
+        cdr.write("?", self.is_bigendian)
+        cdr.write("I", self.point_step)
+        cdr.write("I", self.row_step)
+        cdr.write("I", len(self.data))
+        cdr.octets(self.data)
+        cdr.write("?", self.is_dense)
+        return cdr.finish()
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        cdr = CdrReader(data)
+        header, height, width = Header.read(cdr), cdr.read("I"), cdr.read("I")
+        fields = tuple(
+            PointField(cdr.string(), cdr.read("I"), cdr.read("B"), cdr.read("I"))
+            for _ in range(cdr.count(smallest_item=13))
+        )
+        big, point_step, row_step = cdr.read("?"), cdr.read("I"), cdr.read("I")
+        points = cdr.octets(cdr.read("I"))
+        return cls(header, height, width, fields, point_step, row_step, points, big, cdr.read("?"))
+
+
+@dataclass(frozen=True, slots=True)
+class LivoxCustomMsg:
+    """livox_ros_driver2/msg/CustomMsg: ``points`` of dtype POINT, their times count from ``timebase_ns``."""
+
+    ROS_TYPE: ClassVar[str] = "livox_ros_driver2/msg/CustomMsg"
+    # A CustomPoint is 19 bytes, but each starts at a multiple of 4: the last one lacks the pad byte.
+    POINT: ClassVar[np.dtype[Any]] = np.dtype(
+        {
+            "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
+            "formats": ["<u4", "<f4", "<f4", "<f4", "u1", "u1", "u1"],
+            "offsets": [0, 4, 8, 12, 16, 17, 18],
+            "itemsize": 20,
+        }
+    )
+    header: Header
+    timebase_ns: int
+    points: NDArray[Any]
+    lidar_id: int = 0
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.write("Q", self.timebase_ns)
+        cdr.write("I", len(self.points))
+        cdr.write("B", self.lidar_id)
+        cdr.octets(bytes(3))
+        cdr.write("I", len(self.points))
+        packed = np.zeros(len(self.points), self.POINT)
+        for name in self.POINT.names or ():
+            packed[name] = self.points[name]
+        cdr.octets(packed.tobytes()[:-1])
+        return cdr.finish()
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        cdr = CdrReader(data)
+        header, timebase, _point_num = Header.read(cdr), cdr.read("Q"), cdr.read("I")
+        lidar_id = cdr.read("B")
+        cdr.octets(3)
+        count = cdr.read("I")
+        size = cls.POINT.itemsize
+        if count == 0:
+            return cls(header, timebase, np.empty(0, cls.POINT), lidar_id)
+        cdr.align(4)
+        raw = cdr.octets(count * size - 1)
+        dtype = cls.POINT if cdr.little else cls.POINT.newbyteorder(">")
+        points = np.ndarray((count - 1,), dtype, raw)
+        last = np.frombuffer(bytes(raw[(count - 1) * size :]) + b"\0", dtype)
+        return cls(header, timebase, np.concatenate([points, last]), lidar_id)
+
+
+@dataclass(frozen=True, slots=True)
+class Imu:
+    """sensor_msgs/msg/Imu: ``gyro`` rad/s and ``accel`` m/s2, (3,) each; a covariance of -1 says unknown."""
+
+    ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/Imu"
+    header: Header
+    gyro: F64
+    accel: F64
+    orientation: F64 = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
+    orientation_covariance: F64 = field(default_factory=lambda: np.array([-1.0] + [0.0] * 8))
+    gyro_covariance: F64 = field(default_factory=lambda: np.zeros(9))
+    accel_covariance: F64 = field(default_factory=lambda: np.zeros(9))
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        parts = (
+            self.orientation,
+            self.orientation_covariance,
+            self.gyro,
+            self.gyro_covariance,
+            self.accel,
+            self.accel_covariance,
+        )
+        cdr.array("d", np.concatenate(parts))
+        return cdr.finish()
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        cdr = CdrReader(data)
+        header, v = Header.read(cdr), cdr.array("d", 37)
+        return cls(header, v[13:16], v[25:28], v[:4], v[4:13], v[16:25], v[28:37])
+
+
+@dataclass(frozen=True, slots=True)
+class CompressedImage:
+    """sensor_msgs/msg/CompressedImage: ``format`` such as ``jpeg``."""
+
+    ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/CompressedImage"
+    header: Header
+    format: str
+    data: Buffer
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.string(self.format)
+        cdr.write("I", len(self.data))
+        cdr.octets(self.data)
+        return cdr.finish()
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        cdr = CdrReader(data)
+        return cls(Header.read(cdr), cdr.string(), cdr.octets(cdr.read("I")))
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """sensor_msgs/msg/Image: ``height`` rows of ``step`` bytes."""
+
+    ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/Image"
+    header: Header
+    height: int
+    width: int
+    encoding: str
+    step: int
+    data: Buffer
+    is_bigendian: bool = False
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.write("I", self.height)
+        cdr.write("I", self.width)
+        cdr.string(self.encoding)
+        cdr.write("B", self.is_bigendian)
+        cdr.write("I", self.step)
+        cdr.write("I", len(self.data))
+        cdr.octets(self.data)
+        return cdr.finish()
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        cdr = CdrReader(data)
+        header, height, width, encoding = Header.read(cdr), cdr.read("I"), cdr.read("I"), cdr.string()
+        big, step = bool(cdr.read("B")), cdr.read("I")
+        return cls(header, height, width, encoding, step, cdr.octets(cdr.read("I")), big)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """sensor_msgs/msg/CameraInfo: ``k`` (9,), ``r`` (9,), ``p`` (12,) row-major, ``d`` of the model."""
+
+    ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/CameraInfo"
+    header: Header
+    height: int
+    width: int
+    distortion_model: str
+    d: F64
+    k: F64
+    r: F64
+    p: F64
+    binning: tuple[int, int] = (0, 0)
+    roi: tuple[int, int, int, int, bool] = (0, 0, 0, 0, False)
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.write("I", self.height)
+        cdr.write("I", self.width)
+        cdr.string(self.distortion_model)
+        cdr.sequence("d", self.d)
+        cdr.array("d", np.concatenate([self.k, self.r, self.p]))
+        for value in (*self.binning, *self.roi[:4]):
+            cdr.write("I", value)
+        cdr.write("?", self.roi[4])
+        return cdr.finish()
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        cdr = CdrReader(data)
+        header, height, width, model = Header.read(cdr), cdr.read("I"), cdr.read("I"), cdr.string()
+        d, v = cdr.sequence("d"), cdr.array("d", 30)
+        binning = cdr.read("I"), cdr.read("I")
+        roi = cdr.read("I"), cdr.read("I"), cdr.read("I"), cdr.read("I"), cdr.read("?")
+        return cls(header, height, width, model, d, v[:9], v[9:18], v[18:30], binning, roi)
+
+
+@dataclass(frozen=True, slots=True)
+class TransformStamped:
+    """One transform: ``T_header.frame_id_child`` as ``translation`` (3,) m and ``rotation`` (4,)."""
+
+    header: Header
+    child_frame_id: str
+    translation: F64
+    rotation: F64
+
+
+@dataclass(frozen=True, slots=True)
+class TFMessage:
+    """tf2_msgs/msg/TFMessage."""
+
+    ROS_TYPE: ClassVar[str] = "tf2_msgs/msg/TFMessage"
+    transforms: tuple[TransformStamped, ...]
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        cdr.write("I", len(self.transforms))
+        for item in self.transforms:
+            item.header.write(cdr)
+            cdr.string(item.child_frame_id)
+            cdr.array("d", np.concatenate([item.translation, item.rotation]))
+        return cdr.finish()
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        cdr = CdrReader(data)
+        transforms = []
+        for _ in range(cdr.count(smallest_item=72)):
+            header, child, v = Header.read(cdr), cdr.string(), cdr.array("d", 7)
+            transforms.append(TransformStamped(header, child, v[:3], v[3:]))
+        return cls(tuple(transforms))
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """nav_msgs/msg/Odometry: pose of the child frame in the header's frame, twist in the child frame."""
+
+    ROS_TYPE: ClassVar[str] = "nav_msgs/msg/Odometry"
+    header: Header
+    child_frame_id: str
+    translation: F64
+    rotation: F64
+    pose_covariance: F64 = field(default_factory=lambda: np.zeros(36))
+    linear: F64 = field(default_factory=lambda: np.zeros(3))
+    angular: F64 = field(default_factory=lambda: np.zeros(3))
+    twist_covariance: F64 = field(default_factory=lambda: np.zeros(36))
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.string(self.child_frame_id)
+        parts = (
+            self.translation,
+            self.rotation,
+            self.pose_covariance,
+            self.linear,
+            self.angular,
+            self.twist_covariance,
+        )
+        cdr.array("d", np.concatenate(parts))
+        return cdr.finish()
+
+    @classmethod
+    def decode(cls, data: Buffer) -> Self:
+        """The message in CDR bytes."""
+        cdr = CdrReader(data)
+        header, child, v = Header.read(cdr), cdr.string(), cdr.array("d", 85)
+        return cls(header, child, v[:3], v[3:7], v[7:43], v[43:46], v[46:49], v[49:85])
