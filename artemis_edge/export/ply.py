@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import replacing
 from artemis_edge.export.mesh import Mesh, PointCloud, bare_mesh, vertex_normals
 from artemis_edge.export.ply_reader import read_mesh, read_ply, read_points
@@ -15,6 +16,7 @@ __all__ = [
     "Mesh",
     "PointCloud",
     "bare_mesh",
+    "find_mesh",
     "read_mesh",
     "read_ply",
     "read_points",
@@ -52,6 +54,14 @@ property list uchar int vertex_indices
 end_header
 """
 _ROWS_AT_ONCE = 1 << 20
+
+
+def find_mesh(map_path: Path) -> Path:
+    """The mesh file of MAP: an output directory or the file itself. Raises InputError if there is none."""
+    path = map_path / "mesh.ply" if map_path.is_dir() else map_path
+    if not path.is_file():
+        raise InputError(f"no mesh at {path}; give an output directory or its mesh.ply")
+    return path
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:

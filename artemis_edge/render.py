@@ -1,0 +1,221 @@
+"""Views of a mesh: depth, triangles and vertex values per pixel; in perspective, through a lens, from above.
+
+Used for reference depth maps, previews, pictures and ``artemis-edge render``. Kernels: ``raster.py``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from artemis_edge.errors import InputError
+from artemis_edge.export.atomic import replacing, write_bytes
+from artemis_edge.export.ply import Mesh, find_mesh, read_mesh
+from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraModel
+from artemis_edge.lens import undistorted_lines
+from artemis_edge.raster import NOTHING, Projection, draw, interpolate, project
+from artemis_edge.trajectory import inverse, matrix_from_quaternion
+
+NEAR_M = 0.05
+# The canvas behind a lens is finer than the picture, so that borders fall within half a pixel of their place.
+_LENS_OVERSAMPLING = 2.0
+_LARGEST_CANVAS = 1 << 25
+_NO_VALUES = np.empty((0, 0), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """An image of ``height`` x ``width`` pixels without lens distortion, and where it is taken from."""
+
+    width: int
+    height: int
+    projection: Projection
+    T_view_world: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Rendering:
+    """``depth`` float32 (h, w) metres along z, NaN where nothing; ``triangle`` int32 (h, w), -1 where
+    nothing; ``values`` float32 (h, w, k): the vertices' values interpolated, 0 where nothing.
+    """
+
+    depth: F32
+    triangle: I32
+    values: F32
+
+    @property
+    def covered(self) -> Bool:
+        """Bool (h, w): the pixel shows a triangle."""
+        shown: Bool = self.triangle != NOTHING
+        return shown
+
+
+def perspective(camera: CameraModel, T_world_cam: F64, near_m: float = NEAR_M, cull: bool = False) -> View:
+    """Pinhole view of ``camera`` (its distortion left aside); ``cull`` hides triangles seen from behind."""
+    projection = Projection(camera.fx, camera.fy, camera.cx, camera.cy, near_m, False, cull)
+    return View(camera.width, camera.height, projection, inverse(T_world_cam))
+
+
+def from_above(low: F64, high: F64, metres_per_pixel: float, cull: bool = True) -> View:
+    """Orthographic view straight down on the box ``low`` .. ``high`` (3,); world z is up, +y up in the image.
+
+    With ``cull``, ceilings seen from behind do not hide the floor.
+    """
+    width, height = (max(int(np.ceil(extent / metres_per_pixel)), 1) for extent in (high - low)[:2])
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[2, 3] = high[2]
+    scale = 1.0 / metres_per_pixel
+    cx, cy = -0.5 - low[0] * scale, -0.5 + high[1] * scale
+    return View(width, height, Projection(scale, scale, cx, cy, -np.inf, True, cull), T)
+
+
+def render(view: View, vertices: F32, faces: I32, values: F32 = _NO_VALUES) -> Rendering:
+    """Draw faces int32 (m, 3) of ``vertices`` float32 (n, 3); ``values`` float32 (n, k) are interpolated."""
+    points, triangle, nearness = _visible(view, vertices, faces)
+    if values.size == 0:
+        return Rendering(_depth(view, nearness), triangle, np.zeros((*triangle.shape, 0), np.float32))
+    return _interpolated(points, faces, triangle, _sight_lines(view), view.projection.orthographic, values)
+
+
+def depth_map(view: View, vertices: F32, faces: I32) -> F32:
+    """Reference depth float32 (h, w): metres along z, NaN where nothing."""
+    return _depth(view, _visible(view, vertices, faces)[2])
+
+
+def render_camera(
+    camera: CameraModel, T_world_cam: F64, vertices: F32, faces: I32, values: F32 = _NO_VALUES
+) -> Rendering:
+    """As :func:`render`, through the camera's lens, so that the result overlays its photograph.
+
+    What is seen at a pixel is decided on a finer pinhole canvas; where its line of sight meets that triangle
+    is computed exactly. Pixels that no line of sight of the lens model reaches show nothing.
+    """
+    if not any(camera.distortion):
+        return render(perspective(camera, T_world_cam), vertices, faces, values)
+    lines = undistorted_lines(camera)
+    canvas = _canvas_behind(camera, lines, T_world_cam)
+    points, triangle, _ = _visible(canvas, vertices, faces)
+    p = canvas.projection
+    reached = np.isfinite(lines[..., 0])
+    x, y = np.nan_to_num(lines[..., 0]), np.nan_to_num(lines[..., 1])
+    u = np.rint(p.fx * x + p.cx).astype(np.int64).clip(0, canvas.width - 1)
+    v = np.rint(p.fy * y + p.cy).astype(np.int64).clip(0, canvas.height - 1)
+    seen = np.where(reached, triangle[v, u], np.int32(NOTHING))
+    return _interpolated(points, faces, seen, lines, False, values)
+
+
+def _visible(view: View, vertices: F32, faces: I32) -> tuple[F32, I32, F32]:
+    """Points in view coordinates, triangle and nearness per pixel."""
+    points, image = np.empty((2, len(vertices), 3), np.float32)
+    project(vertices, view.T_view_world, view.projection, points, image)
+    nearness = np.full((view.height, view.width), -np.inf, np.float32)
+    triangle = np.full((view.height, view.width), NOTHING, np.int32)
+    draw(points, image, faces, view.projection, 0, nearness, triangle)
+    return points, triangle, nearness
+
+
+def _depth(view: View, nearness: F32) -> F32:
+    with np.errstate(divide="ignore"):
+        depth = -nearness if view.projection.orthographic else 1.0 / nearness
+    return np.where(nearness == -np.inf, np.float32(np.nan), depth)
+
+
+def _sight_lines(view: View) -> F32:
+    p = view.projection
+    lines = np.empty((view.height, view.width, 2), np.float32)
+    lines[..., 0] = (np.arange(view.width) - p.cx) / p.fx
+    lines[..., 1] = ((np.arange(view.height) - p.cy) / p.fy)[:, None]
+    return lines
+
+
+def _interpolated(
+    points: F32, faces: I32, triangle: I32, lines: F32, orthographic: bool, values: F32
+) -> Rendering:
+    depth = np.full(triangle.shape, np.nan, np.float32)
+    out = np.zeros((*triangle.shape, values.shape[1]), np.float32)
+    values = np.ascontiguousarray(values, np.float32)
+    interpolate(points, faces, triangle, lines, orthographic, values, out, depth)
+    return Rendering(depth, triangle, out)
+
+
+def _canvas_behind(camera: CameraModel, lines: F32, T_world_cam: F64) -> View:
+    """Pinhole view that holds every line of sight; coarser only where the lens is so wide that it must be."""
+    if not np.isfinite(lines).any():
+        raise InputError("no pixel has a line of sight with this distortion; check k1 k2 p1 p2 k3")
+    low, high = np.nanmin(lines, axis=(0, 1)), np.nanmax(lines, axis=(0, 1))
+    f = np.array([camera.fx, camera.fy]) * _LENS_OVERSAMPLING
+    f *= min(1.0, np.sqrt(_LARGEST_CANVAS / np.prod((high - low) * f + 2.0)))
+    width, height = (int(n) for n in np.ceil((high - low) * f) + 2)
+    cx, cy = 1.0 - low * f
+    projection = Projection(float(f[0]), float(f[1]), float(cx), float(cy), NEAR_M, False, False)
+    return View(width, height, projection, inverse(T_world_cam))
+
+
+def overlay(mesh: Mesh, camera: CameraModel, T_world_cam: F64) -> tuple[U8, F32]:
+    """RGBA uint8 (h, w, 4) of the mesh's colours, alpha 0 where nothing, and depth float32 (h, w)."""
+    seen = render_camera(camera, T_world_cam, mesh.vertices, mesh.faces, mesh.colours.astype(np.float32))
+    rgba = np.zeros((camera.height, camera.width, 4), np.uint8)
+    rgba[..., :3] = np.rint(seen.values).clip(0, 255)
+    rgba[..., 3] = np.where(seen.covered, 255, 0)
+    return rgba, seen.depth
+
+
+def run(
+    map_path: Path, pose: str, intrinsics: str, distortion: str | None, out: Path, depth: Path | None = None
+) -> None:
+    """The command ``render``: texts as given there, PNG to ``out``, depth as .npy to ``depth``."""
+    camera, T_world_cam = parse_camera(intrinsics, distortion), parse_pose(pose)
+    rgba, z = overlay(read_mesh(find_mesh(map_path)), camera, T_world_cam)
+    write_png(out, rgba)
+    if depth is not None:
+        with replacing(depth) as file:
+            np.save(file, z)
+
+
+def write_png(path: Path, image: U8) -> None:
+    """Write RGB or RGBA uint8 (h, w, 3 or 4) as PNG."""
+    write_bytes(path, png_bytes(image))
+
+
+def png_bytes(image: U8) -> bytes:
+    """RGB or RGBA uint8 (h, w, 3 or 4) as the bytes of a PNG."""
+    order = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    return bytes(cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(image), order))[1])
+
+
+def parse_pose(text: str) -> F64:
+    """T_world_cam (4, 4) of "tx ty tz qx qy qz qw"; raises InputError."""
+    numbers = _numbers(text, 7, "--pose", "tx ty tz qx qy qz qw")
+    if not np.linalg.norm(numbers[3:]) > 0.0:
+        raise InputError("--pose: the quaternion qx qy qz qw must not be zero")
+    return matrix_from_quaternion(numbers[:3], numbers[3:])
+
+
+def parse_camera(intrinsics: str, distortion: str | None) -> CameraModel:
+    """Camera of "w h fx fy cx cy" and "k1 k2 p1 p2 k3"; raises InputError."""
+    w, h, fx, fy, cx, cy = _numbers(intrinsics, 6, "--intrinsics", "w h fx fy cx cy").tolist()
+    if not (w >= 1 and h >= 1 and w == int(w) and h == int(h) and fx > 0 and fy > 0):
+        raise InputError("--intrinsics: w and h must be whole numbers of pixels, fx and fy positive")
+    if w * h > _LARGEST_CANVAS:
+        raise InputError(
+            f"--intrinsics: {w:.0f} x {h:.0f} pixels are too many; ask for at most 33 megapixels"
+        )
+    k1, k2, p1, p2, k3 = (
+        (0.0,) * 5
+        if distortion is None
+        else _numbers(distortion, 5, "--distortion", "k1 k2 p1 p2 k3").tolist()
+    )
+    return CameraModel(int(w), int(h), fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+
+
+def _numbers(text: str, count: int, option: str, form: str) -> F64:
+    try:
+        numbers = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f'{option}: write it as {count} numbers "{form}"')
+    return numbers
