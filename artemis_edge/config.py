@@ -27,6 +27,39 @@ def _float(text: str, *, ge: float | None = None, gt: float | None = None, le: f
 class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """LiDAR odometry, used when no poses are given (section III-A of the paper, odometry/)."""
 
+    voxel_m: Annotated[float, _float("Edge of the finest voxel that holds a plane, m.", ge=0.05, le=5.0)] = 0.5
+    levels: Annotated[int, Meta(description="Sizes of voxel planes, each twice the last.", ge=1, le=6)] = 4
+    max_voxels: Annotated[
+        int, Meta(description="Voxels of all sizes in the local map; about 250 bytes each.", ge=10_000)
+    ] = 300_000
+    insert_m: Annotated[
+        float, _float("Spacing of the points that a scan adds to the local map, m.", ge=0.01, le=2.0)
+    ] = 0.15
+    points: Annotated[
+        int, Meta(description="Points of a scan that are registered, about; more are slower.", ge=200)
+    ] = 4000
+    min_range_m: Annotated[
+        float, _float("Nearer points belong to the operator or the vehicle and are not registered, m.", ge=0.0)
+    ] = 0.5
+    max_range_m: Annotated[
+        float, _float("Farther points are not registered, and farther voxels are forgotten, m.", gt=1.0)
+    ] = 100.0
+    sigma_m: Annotated[
+        float, _float("Noise of one measured point along the surface normal, m.", gt=0.0, le=1.0)
+    ] = 0.03
+    acceleration: Annotated[
+        float, _float("What the sensor's carrier may do to its velocity, m/s2.", gt=0.0)
+    ] = 3.0
+    angular_acceleration: Annotated[
+        float, _float("What the sensor's carrier may do to its turn rate, rad/s2.", gt=0.0)
+    ] = 6.0
+    start_speed: Annotated[
+        float, _float("How fast the sensor may already move when the recording starts, m/s.", gt=0.0)
+    ] = 15.0
+    start_turn: Annotated[
+        float, _float("How fast the sensor may already turn when the recording starts, rad/s.", gt=0.0)
+    ] = 0.5
+
 
 class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """Voxel grid that scans are allocated to (section III-B, voxel_map.py)."""

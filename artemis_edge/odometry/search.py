@@ -1,0 +1,40 @@
+"""Guesses around a prediction, for when the prediction may lie outside the reach of Gauss-Newton.
+
+A carried sensor at 2 Hz turns 40 deg between two scans; a car's first two scans lie a metre apart with nothing known
+of its speed. The score of a few hundred points on the coarse planes tells good guesses from bad ones (in the manner
+of Olson's correlative scan matching, ICRA 2009).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from artemis_edge.frames import F64
+from artemis_edge.odometry import se3
+
+_RINGS = 3  # guesses at 1/3, 2/3 and 3/3 of the reach
+
+
+def ball(radius: float, spacing: float) -> F64:
+    """Lattice points (n, 3) within a radius, the origin first, at most ``2 * _RINGS + 1`` along an axis."""
+    steps = min(int(np.ceil(radius / spacing)), _RINGS) if radius > 0 else 0
+    axis = np.arange(-steps, steps + 1) * (radius / max(steps, 1))
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    length = np.linalg.norm(grid, axis=1)
+    order = np.argsort(length, kind="stable")
+    inside: F64 = grid[order][length[order] <= radius * (1 + 1e-9)]
+    return inside
+
+
+def guesses(T_world_lidar: F64, reach_m: float, reach_rad: float, arm_m: float, basin_m: float) -> list[F64]:
+    """Poses around a guess: shifted up to ``reach_m``, then turned up to ``reach_rad``; the guess itself first.
+
+    ``arm_m`` is the distance at which a turn displaces points, ``basin_m`` the displacement that registration
+    mends by itself, hence the spacing.
+    """
+    shifts = ball(reach_m, basin_m)
+    turns = ball(reach_rad, basin_m / arm_m)[1:]
+    twists = np.zeros((len(shifts) + len(turns), 6))
+    twists[: len(shifts), :3] = shifts
+    twists[len(shifts) :, 3:] = turns
+    return [T_world_lidar @ se3.exp(twist) for twist in twists]
