@@ -1,0 +1,242 @@
+"""A town street, metre-true and seeded: road, kerbs, pavements, houses, parked cars and what stands around.
+
+x runs along the street, y = 0 is the middle of the road, z up. The street is made of blocks of BLOCK_M metres
+that follow from (seed, number), so that it can be as long as a walk needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from artemis_drivers.virtual import furniture
+from artemis_drivers.virtual.building import add_gate_wall, add_house
+from artemis_drivers.virtual.car import add_car
+from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder, Shape, WorldMesh
+from artemis_drivers.virtual.shapes import pose, solid
+from artemis_drivers.virtual.textures import TextureAtlas, build_atlas
+from artemis_drivers.virtual.world import World
+
+Rng = np.random.Generator
+BLOCK_M = 40.0
+STATION_M = 1.0  # spacing of the ground's cross sections
+KERB_M = 0.12  # height of the kerb
+EYE_M = 1.45  # height at which the rig is held
+INSTANCES_PER_BLOCK = 4096
+HOUSE_DEPTH_M = 9.0
+END_MARGIN_M = 8.0  # the path keeps this far from the ends of the street
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """What all blocks of a street share."""
+
+    seed: int
+    length: float
+    road: float  # half width of the road
+    pavement: float
+    wave: tuple[float, float, float]  # long waves of the ground: amplitude, length, phase
+    tints: tuple[tuple[float, float, float], ...]  # road, pavement, kerb
+
+    @property
+    def front(self) -> float:
+        """Distance of the house fronts from the middle."""
+        return self.road + 0.15 + self.pavement
+
+    def level(self, x: float | F64) -> F64:
+        """Height of the middle of the road at ``x``."""
+        amplitude, wavelength, phase = self.wave
+        x = np.asarray(x, np.float64)
+        slow = np.sin(2 * np.pi * x / wavelength + phase)
+        return amplitude * (slow + 0.3 * np.sin(2 * np.pi * x / 17.3 + 2 * phase))
+
+    def ground(self, x: float, y: float) -> float:
+        """Height of the ground, kerb included."""
+        side, height = self.section()
+        return float(self.level(x) + np.interp(abs(y), side, height))
+
+    def section(self) -> tuple[F64, F64]:
+        """Half cross section: distances from the middle and heights above the middle of the road."""
+        crown = 0.02 * self.road  # 2 % fall towards the gutter
+        kerb = self.road + 0.15
+        y = [0.0, 0.06, self.road - 2.1, self.road - 0.25, self.road, self.road + 0.012, kerb, self.front, self.front + 12]  # fmt: skip
+        gutter = -crown
+        top = gutter + KERB_M
+        fall = 0.015 * self.pavement
+        z = [0.0, -0.001, -crown * 0.5, gutter + 0.01, gutter, top, top + 0.003, top + fall, top + fall + 0.02]
+        return np.array(y), np.array(z)
+
+
+def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -> World:
+    """A street of at least ``length`` metres (whole blocks of 40 m); the seed decides layout, sizes, colours."""
+    blocks = max(int(np.ceil(length / BLOCK_M)), 2)
+    rng = np.random.default_rng([seed, 1])
+    layout = _Layout(
+        seed=seed,
+        length=blocks * BLOCK_M,
+        road=float(rng.uniform(3.9, 4.8)),
+        pavement=float(rng.uniform(2.4, 3.4)),
+        wave=(float(rng.uniform(0.05, 0.25)), float(rng.uniform(45, 80)), float(rng.uniform(0, 2 * np.pi))),
+        tints=tuple(tuple((rng.uniform(0.85, 1.1) * np.array(c)).tolist()) for c in ((1, 1, 1), (0.85, 0.82, 0.78), (0.95, 0.95, 0.93))),  # fmt: skip
+    )
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 60))
+    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])  # fmt: skip
+    atlas = build_atlas(seed) if atlas is None else atlas
+    return World(
+        name="street",
+        seed=seed,
+        block_edges=np.arange(blocks + 1) * BLOCK_M,
+        build_block=lambda k: _block(layout, atlas, k, blocks),
+        path=_path(layout, rng),
+        sun=sun,
+        atlas=atlas,
+    )
+
+
+def _path(layout: _Layout, rng: Rng) -> F64:
+    """The walker keeps near the middle of the road and drifts slowly from side to side."""
+    x = np.arange(END_MARGIN_M, layout.length - END_MARGIN_M, 0.5)
+    free = layout.road - 2.1 - 0.8  # parked cars take 2.1 m
+    phase = rng.uniform(0, 2 * np.pi, 2)
+    y = free * (0.6 * np.sin(2 * np.pi * x / 31.0 + phase[0]) + 0.3 * np.sin(2 * np.pi * x / 13.7 + phase[1]))
+    return np.column_stack([x, y, layout.level(x) + EYE_M])
+
+
+def _block(layout: _Layout, atlas: TextureAtlas, number: int, blocks: int) -> WorldMesh:
+    rng = np.random.default_rng([layout.seed, 2, number])
+    builder = MeshBuilder(atlas.index, number * INSTANCES_PER_BLOCK)
+    x0 = number * BLOCK_M
+    _add_ground(builder, layout, x0)
+    for side in (1.0, -1.0):
+        _add_houses(builder, layout, rng, x0, side)
+        _add_parked_cars(builder, layout, rng, x0, side)
+        _add_furniture(builder, layout, rng, x0, side)
+    if number == 0:
+        _add_end(builder, layout, rng, 0.0, np.pi / 2)
+    if number == blocks - 1:
+        _add_end(builder, layout, rng, layout.length, -np.pi / 2)
+    return builder.build()
+
+
+def _strip(xs: F64, y: tuple[float, float], z: tuple[F64, F64], rows: NDArray[np.bool_]) -> Shape:
+    """Sheet between two lines along the street, facing up (y ascending), only the chosen rows."""
+    a = np.column_stack([xs, np.full(len(xs), y[0]), z[0]])
+    b = np.column_stack([xs, np.full(len(xs), y[1]), z[1]])
+    k = np.flatnonzero(rows)
+    n = len(xs)
+    quads = [np.stack([k, k + 1, k + 1 + n], -1), np.stack([k, k + 1 + n, k + n], -1)]
+    return solid(np.concatenate([a, b]), np.stack(quads, axis=1).reshape(-1, 3).astype(np.int32))
+
+
+def _add_ground(builder: MeshBuilder, layout: _Layout, x0: float) -> None:
+    """The ground is a sheet over an endless solid: it has an upper side only."""
+    xs = x0 + np.arange(0, BLOCK_M + STATION_M / 2, STATION_M)
+    level = layout.level(xs)
+    side, height = layout.section()
+    materials = ["lane_paint", "asphalt", "asphalt", "cobbles", "kerbstone", "kerbstone", "paving", "paving"]
+    tints = [0, 0, 0, 0, 2, 2, 1, 1]
+    every = np.ones(len(xs) - 1, bool)
+    dash = (np.floor((xs[:-1] + 0.5) / 3.0) % 2) == 0
+    builder.begin("ground")
+    for k, material in enumerate(materials):
+        for sign in (1.0, -1.0):
+            a, b = (k, k + 1) if sign > 0 else (k + 1, k)
+            y = (sign * side[a], sign * side[b])
+            z = (level + height[a], level + height[b])
+            if material == "lane_paint":
+                builder.add(_strip(xs, y, z, ~dash), "asphalt", layout.tints[0])
+            rows = dash if material == "lane_paint" else every
+            builder.add(_strip(xs, y, z, rows), material, layout.tints[tints[k]])
+
+
+def _side_pose(layout: _Layout, x: float, y: float, side: float, yaw: float = 0.0) -> F64:
+    """Pose on the ground at distance ``y`` from the middle; local -y looks to the road, whatever the side."""
+    return pose(x, side * y, layout.ground(x, y), yaw + (0.0 if side > 0 else np.pi))
+
+
+def _add_houses(builder: MeshBuilder, layout: _Layout, rng: Rng, x0: float, side: float) -> None:
+    gap = rng.uniform(2.2, 3.2) if rng.random() < 0.6 else 0.0
+    count = int(rng.integers(3, 5))
+    shares = rng.uniform(0.8, 1.25, count)
+    widths = shares / shares.sum() * (BLOCK_M - gap)
+    gap_after = int(rng.integers(0, count))
+    x = x0
+    for k, width in enumerate(widths):
+        setback = rng.uniform(0.0, 0.35)
+        _place_front(builder, layout, rng, x, width, setback, side, add_house)
+        x += width
+        if k == gap_after and gap > 0:
+            _place_front(builder, layout, rng, x, gap, 1.2, side, add_gate_wall)
+            x += gap
+
+
+def _place_front(
+    builder: MeshBuilder,
+    layout: _Layout,
+    rng: Rng,
+    x: float,
+    width: float,
+    setback: float,
+    side: float,
+    add: Callable[..., None],
+) -> None:
+    left = x if side > 0 else x + width
+    y = layout.front + setback
+    T = _side_pose(layout, left, y, side)
+    T[2, 3] = min(layout.ground(x, y), layout.ground(x + width, y)) + 0.02
+    if add is add_house:
+        add_house(builder, rng, T, width, HOUSE_DEPTH_M)
+    else:
+        add(builder, rng, T, width)
+
+
+def _add_end(builder: MeshBuilder, layout: _Layout, rng: Rng, x: float, yaw: float) -> None:
+    """Houses across the end of the street; local -y must look back along it."""
+    wide = 2 * layout.front / 2 + 3.0
+    direction = 1.0 if yaw > 0 else -1.0
+    for k in (-1.0, 0.0):
+        T = pose(x - direction * 0.05, direction * k * wide, float(layout.level(x)), yaw)
+        add_house(builder, rng, T, wide, HOUSE_DEPTH_M)
+
+
+def _add_parked_cars(builder: MeshBuilder, layout: _Layout, rng: Rng, x0: float, side: float) -> None:
+    x = x0 + rng.uniform(2.5, 5.0)
+    while x < x0 + BLOCK_M - 2.6:
+        if rng.random() < 0.62:
+            y = layout.road - 1.05 - rng.uniform(0.0, 0.1)
+            slope = float(layout.level(x + 1.3) - layout.level(x - 1.3)) / 2.6
+            T = pose(x, side * y, layout.ground(x, y), rng.normal(0, 0.015), -np.arctan(slope))
+            # right-hand traffic: cars on the +y side come towards us
+            add_car(builder, rng, T @ pose(yaw=np.pi if side > 0 else 0.0))
+        x += rng.uniform(5.6, 7.5)
+
+
+def _add_furniture(builder: MeshBuilder, layout: _Layout, rng: Rng, x0: float, side: float) -> None:
+    near_kerb = layout.road + 0.55
+    near_house = layout.front - 0.5
+    slots = x0 + 1.2 + np.arange(14) * (BLOCK_M - 2.4) / 13 + rng.uniform(-0.35, 0.35, 14)
+    kinds = ["tree", "lamp", "tree", "sign", "person", "bench", "bin", "tree", "person", "boxes", "bollard", "cabinet", "bollard", "bench"]  # fmt: skip
+    for x, kind in zip(slots, rng.permutation(kinds), strict=True):
+        if kind == "tree":
+            furniture.add_tree(builder, rng, _side_pose(layout, x, near_kerb + 0.1, side, rng.uniform(0, 6)))
+        elif kind == "lamp":
+            furniture.add_lamp(builder, rng, _side_pose(layout, x, near_kerb - 0.15, side, -np.pi / 2))
+        elif kind == "sign":
+            T = _side_pose(layout, x, near_kerb, 1.0) if side > 0 else _side_pose(layout, x, near_kerb, -1.0, np.pi)  # fmt: skip
+            furniture.add_road_sign(builder, rng, T @ pose(yaw=np.pi if side > 0 and rng.random() < 0.5 else 0.0))
+        elif kind == "person":
+            y = rng.uniform(near_kerb + 0.4, near_house - 0.2)
+            furniture.add_person(builder, rng, _side_pose(layout, x, y, side, rng.uniform(0, 2 * np.pi)))
+        elif kind == "bench":
+            furniture.add_bench(builder, rng, _side_pose(layout, x, near_house + 0.1, side))
+        elif kind == "bin":
+            furniture.add_bin(builder, rng, _side_pose(layout, x, near_kerb + 0.05, side, rng.uniform(0, 6)))
+        elif kind == "boxes":
+            furniture.add_boxes(builder, rng, _side_pose(layout, x, near_house + 0.1, side))
+        elif kind == "bollard":
+            furniture.add_bollard(builder, rng, _side_pose(layout, x, near_kerb - 0.2, side))
+        else:
+            furniture.add_cabinet(builder, rng, _side_pose(layout, x, near_house + 0.2, side))

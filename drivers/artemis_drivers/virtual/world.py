@@ -1,0 +1,49 @@
+"""A virtual world: what every street, yard or hall offers to the virtual sensors.
+
+A world is cut into blocks along its walkable path. A block is built from the seed and its number alone, so that
+a walk of twenty minutes through ever new places needs only the blocks around the sensor in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from artemis_drivers.virtual.mesh_builder import CLASS_NAMES, F64, WorldMesh, joined
+from artemis_drivers.virtual.textures import TextureAtlas
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A seeded world.
+
+    ``block_edges`` float64 (blocks + 1,): block k covers x in ``block_edges[k]..block_edges[k + 1]`` metres;
+    ``build_block(k)`` makes its triangles; ``path`` float64 (n, 3) is the line a walker's eyes follow, metres;
+    ``sun`` unit vector towards the sun.
+    """
+
+    name: str
+    seed: int
+    block_edges: F64
+    build_block: Callable[[int], WorldMesh]
+    path: F64
+    sun: F64
+    atlas: TextureAtlas
+    class_names: tuple[str, ...] = CLASS_NAMES
+
+    @property
+    def block_count(self) -> int:
+        """Number of blocks."""
+        return len(self.block_edges) - 1
+
+    def blocks_near(self, x: float, reach_m: float) -> range:
+        """Numbers of the blocks that have a part within ``reach_m`` of ``x``."""
+        first = int(np.searchsorted(self.block_edges[1:], x - reach_m, side="right"))
+        last = int(np.searchsorted(self.block_edges[:-1], x + reach_m, side="left"))
+        return range(min(first, self.block_count - 1), max(last, first + 1))
+
+    def mesh(self, blocks: range | None = None) -> WorldMesh:
+        """Triangles of the given blocks (all without)."""
+        return joined([self.build_block(k) for k in (range(self.block_count) if blocks is None else blocks)])
