@@ -7,8 +7,9 @@ CdrError.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +24,25 @@ FIELD_CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8:
 FIELD_TYPES = {code: number for number, code in FIELD_CODES.items()}
 
 
-class Message(Protocol):
-    """A message that can stand in a session."""
+class Message(ABC):
+    """A message that can stand in a session; ``decode`` and ``encode`` are inverse."""
 
+    __slots__ = ()
     ROS_TYPE: ClassVar[str]
 
+    @abstractmethod
     def encode(self) -> bytes:
         """The CDR bytes."""
-        ...
+
+    @classmethod
+    @abstractmethod
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader; CdrError if it is no such message."""
 
     @classmethod
     def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        ...
+        """The message in CDR bytes; CdrError if they are none."""
+        return cls.read(CdrReader(data))
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +55,7 @@ class Header:
     @classmethod
     def read(cls, cdr: CdrReader) -> Self:
         """From the position of a reader."""
-        seconds, nanoseconds = cdr.read("i"), cdr.read("I")
+        seconds, nanoseconds = cdr.stamp()
         return cls(seconds * _SECOND_NS + nanoseconds, cdr.string())
 
     def write(self, cdr: CdrWriter) -> None:
@@ -57,11 +64,6 @@ class Header:
         cdr.write("i", seconds)
         cdr.write("I", nanoseconds)
         cdr.string(self.frame_id)
-
-
-def peek_header(data: Buffer) -> Header:
-    """Header of a message that starts with one; the rest of the message need not be there."""
-    return Header.read(CdrReader(data))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,7 @@ class PointField:
 
 
 @dataclass(frozen=True, slots=True)
-class PointCloud2:
+class PointCloud2(Message):
     """sensor_msgs/msg/PointCloud2: ``data`` holds ``height`` rows of ``row_step`` bytes."""
 
     ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/PointCloud2"
@@ -110,9 +112,8 @@ class PointCloud2:
         return cdr.finish()
 
     @classmethod
-    def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        cdr = CdrReader(data)
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
         header, height, width = Header.read(cdr), cdr.read("I"), cdr.read("I")
         fields = tuple(
             PointField(cdr.string(), cdr.read("I"), cdr.read("B"), cdr.read("I"))
@@ -124,7 +125,7 @@ class PointCloud2:
 
 
 @dataclass(frozen=True, slots=True)
-class LivoxCustomMsg:
+class LivoxCustomMsg(Message):
     """livox_ros_driver2/msg/CustomMsg: ``points`` of dtype POINT, their times count from ``timebase_ns``."""
 
     ROS_TYPE: ClassVar[str] = "livox_ros_driver2/msg/CustomMsg"
@@ -158,26 +159,16 @@ class LivoxCustomMsg:
         return cdr.finish()
 
     @classmethod
-    def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        cdr = CdrReader(data)
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
         header, timebase, _point_num = Header.read(cdr), cdr.read("Q"), cdr.read("I")
-        lidar_id = cdr.read("B")
-        cdr.octets(3)
+        lidar_id, _reserved = cdr.read("B"), cdr.octets(3)
         count = cdr.read("I")
-        size = cls.POINT.itemsize
-        if count == 0:
-            return cls(header, timebase, np.empty(0, cls.POINT), lidar_id)
-        cdr.align(4)
-        raw = cdr.octets(count * size - 1)
-        dtype = cls.POINT if cdr.little else cls.POINT.newbyteorder(">")
-        points = np.ndarray((count - 1,), dtype, raw)
-        last = np.frombuffer(bytes(raw[(count - 1) * size :]) + b"\0", dtype)
-        return cls(header, timebase, np.concatenate([points, last]), lidar_id)
+        return cls(header, timebase, cdr.structures(cls.POINT, count, last_size=19), lidar_id)
 
 
 @dataclass(frozen=True, slots=True)
-class Imu:
+class Imu(Message):
     """sensor_msgs/msg/Imu: ``gyro`` rad/s and ``accel`` m/s2, (3,) each; a covariance of -1 says unknown."""
 
     ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/Imu"
@@ -205,15 +196,14 @@ class Imu:
         return cdr.finish()
 
     @classmethod
-    def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        cdr = CdrReader(data)
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
         header, v = Header.read(cdr), cdr.array("d", 37)
         return cls(header, v[13:16], v[25:28], v[:4], v[4:13], v[16:25], v[28:37])
 
 
 @dataclass(frozen=True, slots=True)
-class CompressedImage:
+class CompressedImage(Message):
     """sensor_msgs/msg/CompressedImage: ``format`` such as ``jpeg``."""
 
     ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/CompressedImage"
@@ -231,14 +221,13 @@ class CompressedImage:
         return cdr.finish()
 
     @classmethod
-    def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        cdr = CdrReader(data)
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
         return cls(Header.read(cdr), cdr.string(), cdr.octets(cdr.read("I")))
 
 
 @dataclass(frozen=True, slots=True)
-class Image:
+class Image(Message):
     """sensor_msgs/msg/Image: ``height`` rows of ``step`` bytes."""
 
     ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/Image"
@@ -264,16 +253,15 @@ class Image:
         return cdr.finish()
 
     @classmethod
-    def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        cdr = CdrReader(data)
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
         header, height, width, encoding = Header.read(cdr), cdr.read("I"), cdr.read("I"), cdr.string()
         big, step = bool(cdr.read("B")), cdr.read("I")
         return cls(header, height, width, encoding, step, cdr.octets(cdr.read("I")), big)
 
 
 @dataclass(frozen=True, slots=True)
-class CameraInfo:
+class CameraInfo(Message):
     """sensor_msgs/msg/CameraInfo: ``k`` (9,), ``r`` (9,), ``p`` (12,) row-major, ``d`` of the model."""
 
     ROS_TYPE: ClassVar[str] = "sensor_msgs/msg/CameraInfo"
@@ -303,9 +291,8 @@ class CameraInfo:
         return cdr.finish()
 
     @classmethod
-    def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        cdr = CdrReader(data)
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
         header, height, width, model = Header.read(cdr), cdr.read("I"), cdr.read("I"), cdr.string()
         d, v = cdr.sequence("d"), cdr.array("d", 30)
         binning = cdr.read("I"), cdr.read("I")
@@ -324,7 +311,7 @@ class TransformStamped:
 
 
 @dataclass(frozen=True, slots=True)
-class TFMessage:
+class TFMessage(Message):
     """tf2_msgs/msg/TFMessage."""
 
     ROS_TYPE: ClassVar[str] = "tf2_msgs/msg/TFMessage"
@@ -341,9 +328,8 @@ class TFMessage:
         return cdr.finish()
 
     @classmethod
-    def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        cdr = CdrReader(data)
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
         transforms = []
         for _ in range(cdr.count(smallest_item=72)):
             header, child, v = Header.read(cdr), cdr.string(), cdr.array("d", 7)
@@ -352,7 +338,7 @@ class TFMessage:
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry:
+class Odometry(Message):
     """nav_msgs/msg/Odometry: pose of the child frame in the header's frame, twist in the child frame."""
 
     ROS_TYPE: ClassVar[str] = "nav_msgs/msg/Odometry"
@@ -382,8 +368,7 @@ class Odometry:
         return cdr.finish()
 
     @classmethod
-    def decode(cls, data: Buffer) -> Self:
-        """The message in CDR bytes."""
-        cdr = CdrReader(data)
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
         header, child, v = Header.read(cdr), cdr.string(), cdr.array("d", 85)
         return cls(header, child, v[:3], v[3:7], v[7:43], v[43:46], v[46:49], v[49:85])

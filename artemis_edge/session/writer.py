@@ -80,7 +80,6 @@ class SessionWriter:
         self._channels: dict[str, tuple[int, str]] = {}
         self._sequence: dict[int, int] = {}
         self._file = self._open()
-        # The library's default name carries its version, and the same input must give the same bytes.
         self._mcap = Writer(self._file, CHUNK_BYTES, CompressionType.LZ4)
         self._guard(lambda: self._start(attachments or {}, metadata or {}))
 
@@ -234,6 +233,7 @@ class SessionWriter:
     def _start(
         self, attachments: Mapping[str, str | bytes], metadata: Mapping[str, Mapping[str, str]]
     ) -> None:
+        # Not the library's own name: it carries a version, and the same calls shall write the same bytes.
         self._mcap.start("ros2", "artemis-edge")
         for name, content in attachments.items():
             media = "application/toml" if name.endswith(".toml") else "application/octet-stream"
