@@ -75,7 +75,7 @@ def from_above(low: F64, high: F64, metres_per_pixel: float, cull: bool = True) 
 def render(view: View, vertices: F32, faces: I32, values: F32 = _NO_VALUES) -> Rendering:
     """Draw faces int32 (m, 3) of ``vertices`` float32 (n, 3); ``values`` float32 (n, k) are interpolated."""
     points, triangle, nearness = _visible(view, vertices, faces)
-    if values.size == 0:
+    if values.shape[1] == 0:
         return Rendering(_depth(view, nearness), triangle, np.zeros((*triangle.shape, 0), np.float32))
     return _interpolated(points, faces, triangle, _sight_lines(view), view.projection.orthographic, values)
 
