@@ -5,22 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from artemis_edge.config import InputConfig
 from artemis_edge.datasets.kitti import open_odometry, open_raw
+from artemis_edge.datasets.rosbag import RosbagSource, bag_files
 from artemis_edge.errors import InputError
 from artemis_edge.frames import FrameSource
 
 _KINDS = "a session or ROS bag (.mcap, .db3, .bag) or a KITTI folder (with velodyne or velodyne_points)"
 
 
-def open_input(path: Path) -> FrameSource:
-    """The frames of a recording or data set, recognised by what it holds.
+def open_input(path: Path, config: InputConfig | None = None) -> FrameSource:
+    """The frames of a recording or data set, recognised by what it holds; ``config`` chooses topics of a bag.
 
     Raises InputError, one sentence, if there is nothing at the path that can be read.
     """
     opener = _opener(path)
     if opener is None:
         raise InputError(_unknown(path))
-    return opener(path)
+    return RosbagSource(path, config) if opener is RosbagSource else opener(path)
 
 
 def _opener(path: Path) -> Callable[[Path], FrameSource] | None:
@@ -28,15 +30,13 @@ def _opener(path: Path) -> Callable[[Path], FrameSource] | None:
         return open_raw
     if (path / "velodyne").is_dir():
         return open_odometry
-    return None
+    return RosbagSource if bag_files(path) else None
 
 
 def _unknown(path: Path) -> str:
     if not path.exists():
         return f"there is no {path}; give {_KINDS}"
-    if not path.is_dir():
-        return f"{path} is no recording; give {_KINDS}"
-    entries = sorted(path.iterdir())
+    entries = sorted(path.iterdir()) if path.is_dir() else []
     if not entries:
         return f"{path} is empty; give {_KINDS}"
     inner = [entry for entry in entries if entry.is_dir() and _opener(entry) is not None]

@@ -6,7 +6,6 @@ its first cloud (CloudFormat), so that one odd cloud cannot change it halfway.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,9 +33,9 @@ _OTHER_CLOCK_S = 10.0
 class CloudFormat:
     """What the optional fields of a topic mean.
 
-    ``time_field`` counts ``unit_s`` seconds, from the header's stamp, or from the epoch (``absolute``), or, by a
-    clock of its own, from the first point (``own_clock``). ``full_intensity`` stands for 1. ``start_s`` is the
-    time of the first point of the first cloud relative to its stamp.
+    ``time_field`` counts ``unit_s`` seconds: from the header's stamp, from the epoch (``absolute``) or, by
+    a clock of its own, from the first point (``own_clock``). ``full_intensity`` stands for 1. ``start_s`` is
+    the time of the first point of the first cloud relative to its stamp.
     """
 
     time_field: str | None = None
@@ -49,7 +48,7 @@ class CloudFormat:
 
 @dataclass(frozen=True, slots=True)
 class CloudPoints:
-    """Valid points (n, 3) float32 of a cloud, ``offset_s`` and ``intensity`` (n,) or None, and what was dropped."""
+    """Valid points (n, 3) of a cloud, ``offset_s`` and ``intensity`` (n,) or None, and what was dropped."""
 
     points: F32
     offset_s: F32 | None
@@ -58,7 +57,7 @@ class CloudPoints:
 
 
 def point_records(message: Cloud) -> NDArray[Any]:
-    """The points as a structured array (n,), a view of the message; CdrError if they do not fit their layout."""
+    """The points as a structured view (n,) of the message; CdrError if they do not fit their layout."""
     if isinstance(message, LivoxCustomMsg):
         return message.points
     dtype, count = _layout(message), message.width * message.height
@@ -93,12 +92,18 @@ def _layout(message: PointCloud2) -> np.dtype[Any]:
     if message.point_step > len(message.data) and message.width * message.height:
         raise CdrError("a point is larger than the cloud")
     layout: Any = {"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step}
-    return np.dtype(layout)
+    dtype: np.dtype[Any] = np.dtype(layout)
+    return dtype
 
 
 def settle_format(message: Cloud) -> CloudFormat:
     """What the fields of a topic mean, judged by one cloud of it."""
     records = point_records(message)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _settle(records, message.header.stamp_ns)
+
+
+def _settle(records: NDArray[Any], stamp_ns: int) -> CloudFormat:
     names = records.dtype.names or ()
     intensity = _intensity_name(names)
     full = 1.0
@@ -110,10 +115,10 @@ def settle_format(message: Cloud) -> CloudFormat:
         return CloudFormat(full_intensity=full)
     unit, absolute = _time_unit(records[time_field])
     settled = CloudFormat(time_field, unit, absolute, False, full)
-    offset = _offset_s(records, settled, message.header.stamp_ns)
+    offset = _offset_s(records, settled, stamp_ns)
     if np.abs(offset[np.isfinite(offset)]).max(initial=0.0) > _OTHER_CLOCK_S:
         settled = CloudFormat(time_field, unit, absolute, True, full)
-        offset = _offset_s(records, settled, message.header.stamp_ns)
+        offset = _offset_s(records, settled, stamp_ns)
     start = float(np.min(offset, initial=0.0, where=np.isfinite(offset)))
     return CloudFormat(time_field, unit, absolute, settled.own_clock, full, start)
 
@@ -121,7 +126,7 @@ def settle_format(message: Cloud) -> CloudFormat:
 def _time_unit(values: NDArray[Any]) -> tuple[float, bool]:
     """Seconds per count of a time field, and whether it counts from the epoch.
 
-    Integers are nanoseconds (Ouster ``t``, Livox ``offset_time``); floats are whatever gives a plausible span.
+    Integers are nanoseconds (Ouster ``t``, Livox ``offset_time``); floats whatever gives a plausible span.
     """
     real = values[np.isfinite(values)].astype(np.float64)
     if len(real) == 0:
@@ -134,35 +139,38 @@ def _time_unit(values: NDArray[Any]) -> tuple[float, bool]:
         unit = next((unit for unit in (1e-9, 1e-6, 1e-3) if top * unit > _EPOCH_S), 1.0)
         if unit < 1.0 or np.ptp(real) < _UNITS[0][1]:
             return unit, True
-    span = float(max(np.ptp(real), top))
+    span = float(np.ptp(real)) or top
     return next(unit for unit, longest in _UNITS if span <= longest), False
 
 
 def _offset_s(records: NDArray[Any], settled: CloudFormat, stamp_ns: int) -> F64:
     """Time (n,) of each point relative to the stamp."""
     values = records[settled.time_field]
-    if settled.own_clock:
-        origin: Any = values.min()
-    elif settled.absolute:
-        origin = stamp_ns if values.dtype.kind in "iu" else stamp_ns / SECOND_NS / settled.unit_s
-    else:
-        origin = 0
     if values.dtype.kind in "iu":
         # In integers: a date in nanoseconds does not fit a float64.
-        difference = values.astype(np.int64) - np.int64(origin)
-    else:
-        difference = values.astype(np.float64) - origin
-    offset: F64 = difference * settled.unit_s
+        counts = values.astype(np.int64)
+        origin = counts.min() if settled.own_clock else stamp_ns if settled.absolute else 0
+        return np.asarray((counts - np.int64(origin)) * settled.unit_s, np.float64)
+    times: F64 = values.astype(np.float64)
+    start = stamp_ns / SECOND_NS / settled.unit_s if settled.absolute else 0.0
+    start = float(times.min()) if settled.own_clock else start
+    offset: F64 = (times - start) * settled.unit_s
     return offset
 
 
 def decode_cloud(message: Cloud, settled: CloudFormat) -> CloudPoints:
     """Arrays of a cloud; points that are no measurements are dropped and counted.
 
-    The arrays are copies: writable, aligned and contiguous, whatever the layout of the message. CdrError if the
-    cloud does not fit its own description.
+    The arrays are copies: writable, aligned and contiguous, whatever the layout of the message. CdrError if
+    the cloud does not fit its own description.
     """
     records = point_records(message)
+    # A driver's garbage may not fit a float32: it becomes infinite and is dropped.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _arrays(records, settled, message.header.stamp_ns)
+
+
+def _arrays(records: NDArray[Any], settled: CloudFormat, stamp_ns: int) -> CloudPoints:
     points = _coordinates(records)
     keep, lost = valid_returns(points)
     if keep is not None:
@@ -173,21 +181,14 @@ def decode_cloud(message: Cloud, settled: CloudFormat) -> CloudPoints:
         intensity = unit_intensity(records[field].astype(np.float32), settled.full_intensity)
     offset = None
     if settled.time_field in names and len(records):
-        offset = _offset_s(records, settled, message.header.stamp_ns).astype(np.float32)
+        offset = _offset_s(records, settled, stamp_ns).astype(np.float32)
         # All at the stamp, as a driver writes that does not time its points.
         offset = offset if offset.any() and np.isfinite(offset).all() else None
     return CloudPoints(points, offset, intensity, lost)
 
 
 def _coordinates(records: NDArray[Any]) -> F32:
-    dtype, points = records.dtype, np.empty((len(records), 3), np.float32)
-    places = [(dtype.fields or {})[axis] for axis in "xyz"]
-    floats = all(place[0] == np.float32 for place in places) and sys.byteorder == "little"
-    start = places[0][1]
-    if floats and [place[1] - start for place in places] == [0, 4, 8] and records.flags.c_contiguous:
-        triple: Any = {"names": ["p"], "formats": ["(3,)<f4"], "offsets": [start], "itemsize": dtype.itemsize}
-        points[:] = records.view(np.dtype(triple))["p"]
-        return points
+    points = np.empty((len(records), 3), np.float32)
     for axis, name in enumerate("xyz"):
         points[:, axis] = records[name]
     return points

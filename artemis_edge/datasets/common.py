@@ -23,9 +23,10 @@ def valid_returns(points: F32) -> tuple[Bool | None, dict[str, int]]:
     ``nan_points`` counts points with a coordinate that is not finite; ``no_return`` all-zero points, by which
     sensors say that a shot came back with nothing.
     """
-    # Not linalg.norm: one pass, and a NaN or an infinity shows in the sum.
-    reach = np.abs(points[:, 0]) + np.abs(points[:, 1]) + np.abs(points[:, 2])
-    keep = (reach > 0.0) & (reach < np.inf)
+    # Not the norm: a NaN or an infinity shows in the sum, and the sum is zero only where all are.
+    with np.errstate(over="ignore", invalid="ignore"):
+        reach = np.abs(points[:, 0]) + np.abs(points[:, 1]) + np.abs(points[:, 2])
+        keep = (reach > 0.0) & (reach < np.inf)
     dropped = len(keep) - int(np.count_nonzero(keep))
     if dropped == 0:
         return None, {}

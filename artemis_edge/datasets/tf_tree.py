@@ -1,8 +1,8 @@
-"""The transform tree of a recording: static mountings, moving parts, and the way from one frame to another."""
+"""The transform tree of a recording: static mountings, moving parts, the way from one frame to another."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from itertools import pairwise
 
 import numpy as np
 
@@ -26,6 +26,13 @@ class _Edge:
         self.values.append(value)
         self._trajectory = None
 
+    def moves(self) -> bool:
+        """Whether the samples differ, or there is but one of something that was published as moving.
+
+        ROS 1 publishes fixed mountings again and again among the moving transforms.
+        """
+        return self.moving and (len(self.values) == 1 or bool(np.ptp(np.array(self.values), axis=0).any()))
+
     def trajectory(self) -> Trajectory:
         """Samples in order of time, the last of each stamp."""
         if self._trajectory is None:
@@ -37,9 +44,9 @@ class _Edge:
         return self._trajectory
 
     def at(self, stamp_ns: I64) -> tuple[F64, Bool]:
-        """``T_parent_child`` (n, 4, 4) and where it is known; a static edge, or one that never moved, always."""
+        """``T_parent_child`` (n, 4, 4) and where it is known: without motion always, else between samples."""
         samples = self.trajectory()
-        if not self.moving:
+        if not self.moves():
             return np.broadcast_to(samples.T_world_lidar[-1], (len(stamp_ns), 4, 4)), np.ones(
                 len(stamp_ns), bool
             )
@@ -79,7 +86,7 @@ class TransformTree:
     def moves(self, frame: str) -> bool:
         """Whether anything between the frame and its root moves."""
         path = self.path_up(frame)
-        return any(self._edges[c][p].moving for c, p in zip(path[:-1], path[1:], strict=True))
+        return any(self._edges[child][parent].moves() for child, parent in pairwise(path))
 
     def connected(self, a: str, b: str) -> bool:
         """Whether there is a way between two frames."""
@@ -98,10 +105,6 @@ class TransformTree:
         T_common_target, known_target = self._chain(up_target[: up_target.index(common) + 1], stamp_ns)
         return inverse(T_common_target) @ T_common_source, known & known_target
 
-    def frames(self) -> Iterable[str]:
-        """All child frames."""
-        return self._edges.keys()
-
     def _parent(self, child: str) -> str | None:
         parents = self._edges.get(child)
         return max(parents, key=lambda name: len(parents[name].stamps)) if parents else None
@@ -109,7 +112,7 @@ class TransformTree:
     def _chain(self, path: list[str], stamp_ns: I64) -> tuple[F64, Bool]:
         """``T_last_first`` of a path upwards."""
         T, known = np.tile(np.eye(4), (len(stamp_ns), 1, 1)), np.ones(len(stamp_ns), bool)
-        for child, parent in zip(path[:-1], path[1:], strict=True):
+        for child, parent in pairwise(path):
             T_parent_child, here = self._edges[child][parent].at(stamp_ns)
             T, known = T_parent_child @ T, known & here
         return T, known

@@ -1,0 +1,260 @@
+"""The sensors of a recording: which topics are used, how they are mounted, and what is left out and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from artemis_edge.config import InputConfig
+from artemis_edge.datasets.bag_index import CLOUDS, IMAGES, BagIndex, OdometryTrack, Track
+from artemis_edge.datasets.cameras import camera_model, encoded_image, info_topics
+from artemis_edge.datasets.clouds import CloudFormat, CloudPoints, decode_cloud, point_records, settle_format
+from artemis_edge.datasets.common import add_counts
+from artemis_edge.errors import InputError
+from artemis_edge.frames import F64, I64, Bool, CameraModel, ImuSamples
+from artemis_edge.session.cdr import CdrError
+from artemis_edge.session.messages import LivoxCustomMsg
+
+_GRAVITY = 9.80665
+# A mean acceleration (norm) in here is gravity in units of g, as the Livox driver writes it.
+_IN_G = (0.7, 1.5)
+# Clouds looked at to settle what the fields of a topic mean: the first ones may be empty or cut.
+_TRIALS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Lidar:
+    """A LiDAR: ``T_lidar_sensor`` (n, 4, 4) and whether it is known, for each of its clouds."""
+
+    name: str
+    track: Track
+    stamp_ns: I64
+    format: CloudFormat
+    T_lidar_sensor: F64
+    known: Bool
+
+    def cloud(self, k: int) -> CloudPoints:
+        """The k-th cloud; CdrError if it cannot be decoded."""
+        reference = self.track.references[k]
+        message = CLOUDS[self.track.ros_type].read(reference.connection.reader(reference.data()))
+        return decode_cloud(message, self.format)
+
+
+@dataclass(frozen=True, slots=True)
+class BagCamera:
+    """A camera: ``T_cam_lidar`` (n, 4, 4) and whether it is known, for each of its images."""
+
+    name: str
+    track: Track
+    stamp_ns: I64
+    model: CameraModel
+    T_cam_lidar: F64
+    known: Bool
+
+    def image(self, k: int) -> bytes:
+        """The k-th image as a file; CdrError if it cannot be decoded."""
+        return _image(self.track, k)
+
+
+def find_lidars(index: BagIndex, config: InputConfig) -> list[Lidar]:
+    """The LiDARs of a recording, the primary one first; InputError if there is none."""
+    tracks = _chosen(index, index.clouds, config.lidar_topics, "lidar_topics")
+    if not tracks:
+        topics = ", ".join(f"{name} ({kind})" for name, kind in sorted(index.types.items())) or "nothing"
+        raise InputError(
+            f"the recording holds no LiDAR clouds (PointCloud2 or livox CustomMsg) but {topics}; "
+            "give one with a LiDAR"
+        )
+    if not config.lidar_topics:
+        tracks = _one_per_frame(index, _not_of_the_world(index, tracks), "lidar_topics")
+    lidars, primary = [], tracks[0].frame_id
+    for track in tracks:
+        stamps = track.stamp_ns()
+        T, known = _mounting(index, primary, track.frame_id, stamps)
+        if not known.all():
+            _leave_out(index, int((~known).sum()), "clouds_without_mounting", track, primary)
+        if known.any():
+            lidars.append(Lidar(_name(track, tracks), track, stamps, _format(index, track), T, known))
+    return lidars
+
+
+def find_cameras(index: BagIndex, config: InputConfig, lidar_frame: str) -> list[BagCamera]:
+    """The calibrated cameras of a recording whose mounting is known; others are left out with a warning."""
+    tracks = _chosen(index, index.images, config.image_topics, "image_topics")
+    if not config.image_topics:
+        tracks = [track for track in tracks if not track.topic.endswith("compressedDepth")]
+        tracks = _one_per_frame(index, tracks, "image_topics")
+    cameras = []
+    for track in tracks:
+        model = _model(index, track)
+        if model is None:
+            add_counts(index.lost, {"images_uncalibrated": len(track.references)})
+            continue
+        stamps = track.stamp_ns()
+        T, known = _mounting(index, track.frame_id, lidar_frame, stamps)
+        if not known.all():
+            _leave_out(index, int((~known).sum()), "images_without_mounting", track, lidar_frame)
+        if known.any():
+            cameras.append(BagCamera(_name(track, tracks), track, stamps, model, T, known))
+    return cameras
+
+
+def find_imu(index: BagIndex, config: InputConfig, lidar_frame: str) -> ImuSamples:
+    """Samples of the chosen IMU in order of time, in the axes of the primary LiDAR, m/s2 and rad/s."""
+    topic = _first(index, index.imus, config.imu_topic, "imu_topic")
+    if topic is None:
+        return ImuSamples.empty()
+    track = index.imus[topic]
+    order = np.argsort(track.stamps, kind="stable")
+    stamps, values = np.array(track.stamps, np.int64)[order], np.array(track.values)[order]
+    R = _imu_rotation(index, topic, track.frame_id, lidar_frame)
+    gyro, accel = values[:, :3] @ R.T, values[:, 3:] @ R.T
+    norm = float(np.median(np.linalg.norm(accel, axis=1)))
+    if _IN_G[0] < norm < _IN_G[1]:
+        index.warnings.append(
+            f"the accelerations of {topic} are taken to be in g: their median is {norm:.2f}"
+        )
+        accel = accel * _GRAVITY
+    return ImuSamples(stamps, gyro, accel)
+
+
+def find_odometry(index: BagIndex, config: InputConfig) -> OdometryTrack | None:
+    """The chosen Odometry topic."""
+    topic = _first(index, index.odometries, config.odometry_topic, "odometry_topic")
+    return None if topic is None else index.odometries[topic]
+
+
+def _chosen(index: BagIndex, tracks: dict[str, Track], wanted: tuple[str, ...], option: str) -> list[Track]:
+    """The topics asked for, or all by name."""
+    for topic in wanted:
+        if topic not in tracks:
+            raise InputError(f"the recording has no topic {topic} for input.{option}; it has {_list(tracks)}")
+    return [tracks[topic] for topic in wanted or sorted(tracks)]
+
+
+def _first(index: BagIndex, tracks: Iterable[str], wanted: str, option: str) -> str | None:
+    topics = sorted(tracks)
+    if wanted and wanted not in topics:
+        raise InputError(f"the recording has no topic {wanted} for input.{option}; it has {_list(topics)}")
+    if len(topics) > 1 and not wanted:
+        index.warnings.append(f"of {_list(topics)} the first is used; choose with --set input.{option}=TOPIC")
+    return wanted or (topics[0] if topics else None)
+
+
+def _list(topics: Iterable[str]) -> str:
+    return ", ".join(sorted(topics)) or "none"
+
+
+def _not_of_the_world(index: BagIndex, tracks: list[Track]) -> list[Track]:
+    """Without clouds that are a product: in a frame above that of another cloud (a map)."""
+    above = {frame for track in tracks for frame in index.tree.path_up(track.frame_id)[1:]}
+    kept = [track for track in tracks if track.frame_id.lstrip("/") not in above]
+    for track in tracks:
+        if track not in kept:
+            index.warnings.append(f"{track.topic} is left out: its frame {track.frame_id} is no sensor's")
+    return kept
+
+
+def _one_per_frame(index: BagIndex, tracks: list[Track], option: str) -> list[Track]:
+    """One topic of each sensor: Livox messages before clouds, compressed before raw images, then by name."""
+    preferred = sorted(tracks, key=lambda t: (t.ros_type not in _PREFERRED, t.topic))
+    chosen: dict[str, Track] = {}
+    for track in preferred:
+        used = chosen.setdefault(track.frame_id, track)
+        if used is not track:
+            index.warnings.append(
+                f"{track.topic} is left out: {used.topic} is of the same frame {track.frame_id}; "
+                f"choose with --set input.{option}"
+            )
+    return sorted(chosen.values(), key=lambda track: track.topic)
+
+
+_PREFERRED = {kind for kind, message in CLOUDS.items() if message is LivoxCustomMsg} | {
+    "sensor_msgs/msg/CompressedImage"
+}
+
+
+def _mounting(index: BagIndex, target: str, source: str, stamp_ns: I64) -> tuple[F64, Bool]:
+    if target.lstrip("/") == source.lstrip("/"):
+        return np.broadcast_to(np.eye(4), (len(stamp_ns), 4, 4)), np.ones(len(stamp_ns), np.bool_)
+    return index.tree.lookup(target, source, stamp_ns)
+
+
+def _leave_out(index: BagIndex, count: int, reason: str, track: Track, frame: str) -> None:
+    add_counts(index.lost, {reason: count})
+    index.warnings.append(
+        f"{count} messages of {track.topic} are left out: tf does not join {track.frame_id} and {frame} there"
+    )
+
+
+def _name(track: Track, tracks: list[Track]) -> str:
+    """The sensor's frame, or its topic where that names several."""
+    shared = sum(other.frame_id == track.frame_id for other in tracks) > 1
+    return (
+        track.topic.strip("/").replace("/", "_")
+        if shared or not track.frame_id
+        else track.frame_id.strip("/")
+    )
+
+
+def _format(index: BagIndex, track: Track) -> CloudFormat:
+    """What the fields of a topic mean, settled on its first cloud that holds points."""
+    for reference in track.references[:_TRIALS]:
+        try:
+            message = CLOUDS[track.ros_type].read(reference.connection.reader(reference.data()))
+            if len(point_records(message)):
+                return settle_format(message)
+        except CdrError:
+            continue
+    index.warnings.append(f"the first {_TRIALS} clouds of {track.topic} are empty; point times are not used")
+    return CloudFormat()
+
+
+def _model(index: BagIndex, track: Track) -> CameraModel | None:
+    info = next((index.infos[t] for t in info_topics(track.topic) if t in index.infos), None)
+    if info is None:
+        info = next((i for i in index.infos.values() if i.header.frame_id == track.frame_id), None)
+    if info is None:
+        index.warnings.append(f"{track.topic} is left out: there is no CameraInfo for it")
+        return None
+    rectified = "rect" in track.topic.removesuffix("/compressed").rpartition("/")[2]
+    model = camera_model(info, rectified)
+    if model is None:
+        index.warnings.append(f"{track.topic} is left out: its CameraInfo is no pinhole with plumb_bob")
+        return None
+    fault = _image_fault(track, model)
+    if fault:
+        index.warnings.append(f"{track.topic} is left out: {fault}")
+    return None if fault else model
+
+
+def _image_fault(track: Track, model: CameraModel) -> str | None:
+    """Why the first image does not fit the model, None if it does."""
+    try:
+        pixels = cv2.imdecode(np.frombuffer(_image(track, 0), np.uint8), cv2.IMREAD_UNCHANGED)
+    except (CdrError, cv2.error) as error:
+        return f"its images cannot be decoded ({error})"
+    if pixels is None:
+        return "its images cannot be decoded"
+    if pixels.shape[:2] != (model.height, model.width):
+        size = f"{pixels.shape[1]} x {pixels.shape[0]}"
+        return f"its images are {size} where CameraInfo says {model.width} x {model.height}"
+    return None
+
+
+def _image(track: Track, k: int) -> bytes:
+    reference = track.references[k]
+    return encoded_image(IMAGES[track.ros_type].read(reference.connection.reader(reference.data())))
+
+
+def _imu_rotation(index: BagIndex, topic: str, frame: str, lidar_frame: str) -> F64:
+    """Rotation (3, 3) of IMU axes to LiDAR axes; identity with a warning where tf does not say."""
+    T, known = _mounting(index, lidar_frame, frame, np.zeros(1, np.int64))
+    if not known.all():
+        index.warnings.append(
+            f"tf does not say how the IMU {topic} is mounted; taken to have the LiDAR's axes"
+        )
+    return T[0, :3, :3]
