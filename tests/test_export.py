@@ -1,7 +1,10 @@
-"""PLY files: what is written is read back, and foreign or broken files are handled."""
+"""PLY and GLB: what is written is read back, and foreign or broken files are handled."""
 
 import errno
+import json
+import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ import trimesh
 
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.export import ply
+from artemis_edge.export.glb import write_glb
 from artemis_edge.export.ply import Mesh, PointCloud, bare_mesh, read_ply, write_ply
 
 
@@ -170,3 +174,76 @@ def test_full_disk_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Monkey
         write_ply(target, coloured_sphere())
     assert [p.name for p in tmp_path.iterdir()] == ["m.ply"]
     assert target.read_bytes() == b"old"
+
+
+def read_chunks(path: Path) -> tuple[dict[str, Any], bytes]:
+    content = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", content)
+    assert (magic, version, length) == (b"glTF", 2, len(content))
+    size, kind = struct.unpack_from("<I4s", content, 12)
+    assert kind == b"JSON" and size % 4 == 0
+    document = json.loads(content[20 : 20 + size])
+    rest = content[20 + size :]
+    if rest:
+        assert struct.unpack_from("<I4s", rest) == (len(rest) - 8, b"BIN\0")
+    return document, rest[8:]
+
+
+def test_glb_opens_elsewhere_upright(tmp_path: Path) -> None:
+    mesh = coloured_sphere()
+    write_glb(tmp_path / "a.glb", mesh)
+    write_glb(tmp_path / "b.glb", mesh)
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+    (other,) = trimesh.load_scene(tmp_path / "a.glb", process=False).geometry.values()
+    assert (len(other.vertices), len(other.faces)) == (len(mesh.vertices), len(mesh.faces))
+    x, y, z = mesh.vertices.T
+    np.testing.assert_array_equal(other.vertices.astype(np.float32), np.stack([x, z, -y], 1))
+    assert other.is_watertight and other.volume > 0  # not turned inside out
+    np.testing.assert_allclose(other.vertex_normals, other.vertices, atol=0.05)
+
+
+def test_glb_colours_are_linear_and_accessors_true(tmp_path: Path) -> None:
+    mesh = coloured_sphere()
+    write_glb(tmp_path / "a.glb", mesh)
+    document, binary = read_chunks(tmp_path / "a.glb")
+    assert document["buffers"] == [{"byteLength": len(binary)}]
+    arrays = []
+    for accessor, view in zip(document["accessors"], document["bufferViews"], strict=True):
+        dtype, width = (
+            {5126: "<f4", 5125: "<u4", 5123: "<u2"}[accessor["componentType"]],
+            accessor["type"][-1],
+        )
+        part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        arrays.append(
+            np.frombuffer(part, dtype).reshape(accessor["count"], int(width) if width.isdigit() else 1)
+        )
+    positions, normals, colours, indices = arrays
+    assert document["accessors"][0]["min"] == positions.min(axis=0).tolist()
+    assert document["accessors"][0]["max"] == positions.max(axis=0).tolist()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(indices.reshape(-1, 3), mesh.faces)
+    assert document["accessors"][2]["normalized"] and (colours[:, 3] == 65535).all()
+    linear = colours[:, :3] / 65535.0
+    srgb = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+    np.testing.assert_array_equal(np.rint(srgb * 255), mesh.colours)
+    assert document["meshes"][0]["extras"]["label_names"] == {"0": "background", "3": "red car"}
+
+
+def test_glb_of_nothing_and_of_nan(tmp_path: Path) -> None:
+    mesh = coloured_sphere()
+    write_glb(tmp_path / "e.glb", bare_mesh(mesh.vertices[:0], mesh.faces[:0]))
+    document, binary = read_chunks(tmp_path / "e.glb")
+    assert document["scenes"] == [{"nodes": []}] and binary == b"" and "meshes" not in document
+    mesh.vertices[0, 0] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        write_glb(tmp_path / "n.glb", mesh)
+
+
+def test_glb_normal_of_a_loose_vertex_is_unit(tmp_path: Path) -> None:
+    loose = bare_mesh(np.eye(4, 3), np.array([[0, 1, 2]], np.int32))
+    assert (loose.normals[3] == 0).all()
+    write_glb(tmp_path / "l.glb", loose)
+    document, binary = read_chunks(tmp_path / "l.glb")
+    view = document["bufferViews"][1]
+    normals = np.frombuffer(binary, "<f4", 12, view["byteOffset"]).reshape(4, 3)
+    assert normals[3].tolist() == [0.0, 1.0, 0.0]
