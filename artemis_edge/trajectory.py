@@ -93,16 +93,30 @@ def _parse_line(line: str, where: str) -> tuple[int, list[float]]:
     if len(words) != _COLUMNS:
         raise InputError(f"{where} has {len(words)} columns; a pose is 'stamp tx ty tz qx qy qz qw'")
     try:
-        seconds, values = Decimal(words[0]), [float(word) for word in words[1:]]
-    except (InvalidOperation, ValueError):
+        values = [float(word) for word in words]
+    except ValueError:
         raise InputError(f"{where} is not eight numbers; a pose is 'stamp tx ty tz qx qy qz qw'") from None
-    if not (seconds.is_finite() and np.isfinite(values).all()):
+    if not np.isfinite(values).all():
         raise InputError(f"{where} holds a value that is not finite; remove that pose")
-    if abs(seconds) > _LAST_S:
-        raise InputError(f"the stamp in {where} is not in seconds; TUM stamps are seconds")
-    if abs(float(np.linalg.norm(values[3:])) - 1.0) > _UNIT_TOLERANCE:
+    try:
+        stamp_ns = parse_seconds(words[0])
+    except (ValueError, OverflowError):
+        raise InputError(f"the stamp in {where} is not in seconds; TUM stamps are seconds") from None
+    if abs(float(np.linalg.norm(values[4:])) - 1.0) > _UNIT_TOLERANCE:
         raise InputError(f"the quaternion in {where} is not of unit length; the order is qx qy qz qw")
-    return int((seconds * 1_000_000_000).to_integral_value()), values
+    return stamp_ns, values[1:]
+
+
+def parse_seconds(text: str) -> int:
+    """Decimal seconds as nanoseconds, exactly; ValueError for no number, OverflowError beyond int64."""
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        raise ValueError(text) from None
+    # Compared, not subtracted: arithmetic on a hostile exponent fails.
+    if seconds.is_nan() or not -_LAST_S < seconds < _LAST_S:
+        raise OverflowError(text)
+    return int((seconds * 1_000_000_000).to_integral_value())
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -136,12 +150,12 @@ def interpolate(trajectory: Trajectory, stamp_ns: I64) -> F64:
     trajectory must not be empty.
     """
     times, poses = trajectory.stamp_ns, trajectory.T_world_lidar
-    after = np.clip(np.searchsorted(times, stamp_ns), 1, max(len(times) - 1, 1))
+    after = np.clip(np.searchsorted(times, stamp_ns, "right"), 1, max(len(times) - 1, 1))
     left, right = after - 1, np.minimum(after, len(times) - 1)
     span = np.maximum(times[right] - times[left], 1)
     share = np.clip((np.asarray(stamp_ns, np.int64) - times[left]) / span, 0.0, 1.0)
-    T = poses[left].copy()
-    inner = np.flatnonzero(share > 0.0)
+    T = poses[np.where(share < 1.0, left, right)]
+    inner = np.flatnonzero((share > 0.0) & (share < 1.0))
     if len(inner):
         start, stop = (
             Rotation.from_matrix(poses[left[inner], :3, :3]),

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import re
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F32, I64, Bool, ImuSamples
+from artemis_edge.trajectory import parse_seconds
 
 SECOND_NS = 1_000_000_000
-_ROUND_NS = Decimal(SECOND_NS)
-# Stamps are int64 nanoseconds.
-_LAST_S = Decimal(9_000_000_000)
 
 
 def valid_returns(points: F32) -> tuple[Bool | None, dict[str, int]]:
@@ -89,12 +86,9 @@ def natural_order(path: Path) -> list[tuple[int, int, str]]:
 def seconds_to_ns(text: str, where: str) -> int:
     """Decimal seconds as nanoseconds, exactly; InputError naming ``where``."""
     try:
-        seconds = Decimal(text)
-    except InvalidOperation:
+        return parse_seconds(text)
+    except (ValueError, OverflowError):
         raise InputError(f"{where} holds '{text[:40]}' where a time in seconds is expected") from None
-    if not seconds.is_finite() or abs(seconds) > _LAST_S:
-        raise InputError(f"{where} holds '{text[:40]}' where a time in seconds is expected")
-    return int((seconds * _ROUND_NS).to_integral_value())
 
 
 def read_lines(path: Path) -> list[str]:
