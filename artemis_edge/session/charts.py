@@ -13,13 +13,14 @@ from artemis_edge.session.drawing import round_length
 PERIOD_MS = 100.0  # a 10 Hz LiDAR leaves this long for a frame
 _COLOURS = ("#2a668a", "#22908a", "#5cb76c", "#e0a526", "#e45a2e", "#c04a8c", "#7a5cc4", "#5a6570")
 _INK, _QUIET, _GRID, _ACCENT = "#26292f", "#6b727c", "#e3e5e8", "#e23e57"
-_WIDTH = 760
+_WIDTH = 560  # of the time charts: half the page, so that their writing shows at its own size
+_PATH_WIDTH = 1120
 _MOST_COLUMNS = 700  # more frames than this are drawn as the largest of each column
 
 
 def stage_chart(stages: dict[str, dict[str, float]]) -> str:
     """A bar to the median and a whisker to p99 per stage; ``stages`` as in ``report.json``."""
-    left, right, row = 170, 120, 30
+    left, right, row = 140, 100, 30
     largest = max([s["p99"] for s in stages.values()] + [1.0])
     scale = (_WIDTH - left - right) / largest
     height = row * len(stages) + 36
@@ -71,9 +72,9 @@ def trajectory_chart(path: F64, reference: F64 | None = None) -> str:
     if len(corners) == 0:
         return ""
     low, extent = corners.min(axis=0), np.maximum(np.ptp(corners, axis=0), 1.0)
-    height = int(np.clip(_WIDTH * extent[1] / extent[0], 160, 420)) + 60
-    scale = float(min((_WIDTH - 60) / extent[0], (height - 80) / extent[1]))
-    offset = 0.5 * (np.array([_WIDTH, height - 20]) - extent * scale)
+    height = int(np.clip(_PATH_WIDTH * extent[1] / extent[0], 160, 420)) + 60
+    scale = float(min((_PATH_WIDTH - 60) / extent[0], (height - 80) / extent[1]))
+    offset = 0.5 * (np.array([_PATH_WIDTH, height - 20]) - extent * scale)
     parts = []
     for line in lines:
         dashed = reference is not None and line is lines[0]
@@ -85,12 +86,12 @@ def trajectory_chart(path: F64, reference: F64 | None = None) -> str:
     for k, colour in ((0, _INK), (-1, _ACCENT)) if len(path) else ():
         u, v = (path[k, :2] - low) * scale + offset
         parts.append(f'<circle cx="{u:.1f}" cy="{height - 20 - v:.1f}" r="5" fill="{colour}"/>')
-    bar = round_length(0.2 * _WIDTH / scale)
+    bar = round_length(0.1 * _PATH_WIDTH / scale)
     parts += [
         f'<rect x="16" y="{height - 12}" width="{bar * scale:.1f}" height="4" fill="{_INK}"/>',
         _text(16, height - 18, f"{bar:g} m"),
     ]
-    return _svg(_WIDTH, height, parts, "Trajectory from above")
+    return _svg(_PATH_WIDTH, height, parts, "Trajectory from above")
 
 
 def _grid(left: float, top: float, right: float, bottom: float, largest: float, scale: float) -> list[str]:

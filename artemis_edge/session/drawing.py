@@ -9,7 +9,7 @@ from artemis_edge.frames import F32, F64, U8, Bool
 
 Colour = tuple[int, int, int]
 
-PAPER: Colour = (250, 250, 248)
+PAPER: Colour = (255, 255, 255)
 INK: Colour = (38, 42, 48)
 PATH: Colour = (226, 62, 87)
 # Label colours: 0, the background, is quiet; the others differ in hue and in lightness.

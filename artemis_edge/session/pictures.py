@@ -88,8 +88,13 @@ def map_from_above(shown: Scene, kind: Kind) -> U8:
     return image
 
 
-def perspective_view(shown: Scene, kind: Kind = "texture") -> U8:
-    """The map from behind and above the way that was gone, RGB uint8 (800, 1200, 3)."""
+def perspective_view(shown: Scene, kind: Kind | None = None) -> U8:
+    """The map from behind and above the way that was gone, RGB uint8 (800, 1200, 3).
+
+    Without a ``kind``: its texture, or its height where no camera has given it any colour.
+    """
+    if kind is None:
+        kind = "texture" if len(shown.vertices) and np.ptp(shown.mesh.colours) > 0 else "height"
     eye, target = _viewpoint(shown)
     size = _SUPERSAMPLING * np.array([WIDTH, HEIGHT])
     f = 0.75 * size[0]
