@@ -15,7 +15,7 @@ from artemis_drivers.virtual.scene import Scene
 from artemis_drivers.virtual.shading import Rasteriser, ShadowMap, shade_image, shadow_map
 
 _OVERSAMPLING = 2.0  # canvas pixels per image pixel, along each axis
-_EXPOSURE_GAIN = 0.95
+_EXPOSURE_GAIN = 1.15
 _UNDISTORT_STEPS = 30
 
 

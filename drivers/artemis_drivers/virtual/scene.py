@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from artemis_drivers.virtual.mesh_builder import F32, F64, U8, U16, WorldMesh, joined
+from artemis_drivers.virtual.mesh_builder import F32, F64, U8, WorldMesh, joined
 from artemis_drivers.virtual.raycast import Bvh, build_bvh
 from artemis_drivers.virtual.textures import SIZE, TextureAtlas
 from artemis_drivers.virtual.world import World
@@ -14,19 +15,17 @@ from artemis_drivers.virtual.world import World
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """What shading needs of each triangle, in coordinates relative to ``Scene.origin``.
+    """What shading needs of each triangle, packed into few cache lines, relative to ``Scene.origin``.
 
-    ``plane`` float32 (m, 4): unit normal n and n.p of its points; ``uv`` float32 (m, 2, 4): u = uv[0, :3].p +
-    uv[0, 3] in metres, and v likewise; ``texels_per_m`` float32 of the picture on this triangle; ``shift``
-    float32 (m, 2) metres added to the coordinates of the slow macro picture.
+    ``rows`` float32 (m, 16): 0-3 unit normal n and n.p of its points; 4-7 and 8-11 texture u and v in metres as
+    affine functions of p; 12 texels per metre of the picture on this triangle; 13-14 metres added to the
+    coordinates of the slow macro picture. ``look`` uint8 (m, 4): tint and material. ``key`` uint32 (m,): equal
+    for triangles of one plane that continue each other's texture.
     """
 
-    plane: F32
-    uv: F32
-    texels_per_m: F32
-    shift: F32
-    material: U16
-    tint: U8
+    rows: F32
+    look: U8
+    key: NDArray[np.uint32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,19 +58,28 @@ def _surface(mesh: WorldMesh, atlas: TextureAtlas, origin: F64) -> Surface:
     d1, d2 = np.cross(e2, normal) / squared, np.cross(normal, e1) / squared
     texture = mesh.uv.astype(np.float64)
     du, dv = texture[:, 1] - texture[:, 0], texture[:, 2] - texture[:, 0]
-    gradient = du[:, :, None] * d1[:, None, :] + dv[:, :, None] * d2[:, None, :]
-    constant = texture[:, 0] - (gradient * a[:, None, :]).sum(axis=2)
     unit = normal / np.sqrt(squared)
+    rows = np.zeros((len(corners), 16), np.float32)
+    rows[:, :3], rows[:, 3] = unit, (unit * a).sum(axis=1)
+    for k in range(2):
+        gradient = du[:, k, None] * d1 + dv[:, k, None] * d2
+        rows[:, 4 + 4 * k : 7 + 4 * k] = gradient
+        rows[:, 7 + 4 * k] = texture[:, 0, k] - (gradient * a).sum(axis=1)
     stretch = np.sqrt(np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]) / np.sqrt(squared[:, 0]))
-    shift = (mesh.instance[:, None].astype(np.int64) * [7919, 104729]) % 1009 / 1009.0 * 11.3
-    return Surface(
-        np.column_stack([unit, (unit * a).sum(axis=1)]).astype(np.float32),
-        np.concatenate([gradient, constant[:, :, None]], axis=2).astype(np.float32),
-        (stretch * SIZE / atlas.metres[mesh.material]).astype(np.float32),
-        shift.astype(np.float32),
-        mesh.material,
-        mesh.tint,
-    )
+    rows[:, 12] = stretch * SIZE / atlas.metres[mesh.material]
+    rows[:, 13:15] = (mesh.instance[:, None].astype(np.int64) * [7919, 104729]) % 1009 / 1009.0 * 11.3
+    look = np.column_stack([mesh.tint, mesh.material.astype(np.uint8)])
+    return Surface(rows, look, _continuation_key(rows, look, mesh.instance))
+
+
+def _continuation_key(rows: F32, look: U8, instance: NDArray[np.int32]) -> NDArray[np.uint32]:
+    """Hash of plane, texture mapping, look and object, rounded to a millimetre."""
+    key = instance.astype(np.uint32)
+    for column in np.rint(rows[:, :12].T * 1000).astype(np.int64).astype(np.uint32):
+        key = key * np.uint32(0x01000193) ^ column
+    for column in look.T:
+        key = key * np.uint32(0x01000193) ^ column
+    return np.asarray(key, np.uint32)
 
 
 class Window:

@@ -6,11 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from artemis_drivers._jit import inline, njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
 from artemis_drivers.virtual.scene import Scene
-from artemis_drivers.virtual.textures import LEVELS, SIZE, TextureAtlas
+from artemis_drivers.virtual.textures import LEVELS, MACRO, MACRO_M, SIZE
+
+U32 = NDArray[np.uint32]
+I64 = NDArray[np.int64]
+Vector = tuple[float, float, float]
 
 #: Draws triangles: (vertices float32 (n, 3), triangles, T_view_world, (fx, fy, cx, cy), (width, height),
 #: orthographic) -> (number of the triangle per pixel, -1 where none; nearness per pixel: 1/z, or -z when
@@ -23,7 +28,7 @@ _SHADOW_BIAS_M = 0.06
 _LARGEST_SHADOW = 8192
 _SUN = (1.25, 1.15, 0.98)  # linear light of the sun and of the sky
 _SKY = (0.42, 0.47, 0.56)
-_MACRO_SPAN_M = 11.3
+_MACRO_MEAN = 217.0  # of 0..255, so that the slow picture keeps the mean brightness
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,31 +64,41 @@ def shadow_map(scene: Scene, sun: F64, rasterise: Rasteriser) -> ShadowMap:
 
 
 @inline
-def _texel(texels: U8, first: int, size: int, x: int, y: int) -> tuple[float, float, float]:
-    k = first + (y & (size - 1)) * size + (x & (size - 1))
-    return float(texels[k, 0]), float(texels[k, 1]), float(texels[k, 2])
-
-
-@inline
-def _bilinear(texels: U8, first: int, size: int, u: float, v: float) -> tuple[float, float, float]:
+def _bilinear(texels: I32, first: int, size: int, u: float, v: float) -> tuple[float, float, float]:
     """Colour 0..255 at picture coordinates u, v (1 = one repetition, v upwards)."""
     x, y = u * size - 0.5, (1.0 - v) * size - 0.5
     x0, y0 = int(np.floor(x)), int(np.floor(y))
     fx, fy = x - x0, y - y0
-    a = _texel(texels, first, size, x0, y0)
-    b = _texel(texels, first, size, x0 + 1, y0)
-    c = _texel(texels, first, size, x0, y0 + 1)
-    d = _texel(texels, first, size, x0 + 1, y0 + 1)
+    mask = size - 1
+    left, right = x0 & mask, (x0 + 1) & mask
+    upper, lower = first + (y0 & mask) * size, first + ((y0 + 1) & mask) * size
+    a, b, c, d = texels[upper + left], texels[upper + right], texels[lower + left], texels[lower + right]
     wa, wb, wc, wd = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
     return (
-        wa * a[0] + wb * b[0] + wc * c[0] + wd * d[0],
-        wa * a[1] + wb * b[1] + wc * c[1] + wd * d[1],
-        wa * a[2] + wb * b[2] + wc * c[2] + wd * d[2],
+        wa * (a & 255) + wb * (b & 255) + wc * (c & 255) + wd * (d & 255),
+        wa * (a >> 8 & 255) + wb * (b >> 8 & 255) + wc * (c >> 8 & 255) + wd * (d >> 8 & 255),
+        wa * (a >> 16) + wb * (b >> 16) + wc * (c >> 16) + wd * (d >> 16),
     )
 
 
+@inline
+def _bilinear_red(texels: I32, first: int, size: int, u: float, v: float) -> float:
+    """Red of :func:`_bilinear`, for grey pictures."""
+    x, y = u * size - 0.5, (1.0 - v) * size - 0.5
+    x0, y0 = int(np.floor(x)), int(np.floor(y))
+    fx, fy = x - x0, y - y0
+    mask = size - 1
+    left, right = x0 & mask, (x0 + 1) & mask
+    upper, lower = first + (y0 & mask) * size, first + ((y0 + 1) & mask) * size
+    high = (1 - fx) * (texels[upper + left] & 255) + fx * (texels[upper + right] & 255)
+    low = (1 - fx) * (texels[lower + left] & 255) + fx * (texels[lower + right] & 255)
+    return (1 - fy) * high + fy * low
+
+
 @njit
-def sample(texels: U8, start: np.ndarray, metres: F32, m: int, u: float, v: float, lod: float) -> tuple[float, float, float]:  # type: ignore[type-arg] # fmt: skip
+def sample(
+    texels: I32, start: I64, metres: F32, m: int, u: float, v: float, lod: float
+) -> tuple[float, float, float]:
     """Colour 0..255 of material ``m`` at u, v metres; ``lod`` is log2 of the pixel's width in texels."""
     lod = min(max(lod, 0.0), LEVELS - 1.001)
     level = int(lod)
@@ -94,6 +109,13 @@ def sample(texels: U8, start: np.ndarray, metres: F32, m: int, u: float, v: floa
         return a
     b = _bilinear(texels, start[m, level + 1], SIZE >> (level + 1), u, v)
     return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2])
+
+
+@njit
+def sample_slow(texels: I32, start: I64, u: float, v: float, lod: float) -> float:
+    """Brightness 0..255 of the slow grey picture at u, v metres."""
+    level = int(min(max(lod, 0.0), LEVELS - 1.001))
+    return _bilinear_red(texels, start[MACRO, level], SIZE >> level, u / MACRO_M, v / MACRO_M)
 
 
 @inline
@@ -118,114 +140,99 @@ def _sunlit(depth: F32, rows: F32, x: float, y: float, z: float) -> float:
     return lit
 
 
-@inline
-def sky_colour(texels: U8, start: np.ndarray, metres: F32, dx: float, dy: float, dz: float) -> tuple[float, float, float]:  # type: ignore[type-arg] # fmt: skip
+@njit
+def sky_colour(texels: I32, start: I64, d: Vector) -> Vector:
     """Linear light of the sky in a direction: haze at the horizon, blue above, clouds."""
-    up = max(dz, 0.0)
+    up = max(d[2], 0.0)
     cloud = 0.0
-    if dz > 0.03:
-        s = 1.5 / dz
-        cloud, _, _ = sample(texels, start, metres, 0, dx * s, dy * s, 1.0)
-        cloud = min(max((cloud - 195.0) / 45.0, 0.0), 1.0) * min(dz * 4.0, 1.0)
+    if d[2] > 0.03:
+        s = 1.5 / d[2]
+        cloud = sample_slow(texels, start, d[0] * s, d[1] * s, 1.0)
+        cloud = min(max((cloud - 195.0) / 45.0, 0.0), 1.0) * min(d[2] * 4.0, 1.0)
     haze = np.exp(-4.0 * up)
-    r = 0.22 + 0.45 * haze
-    g = 0.40 + 0.32 * haze
-    b = 0.75 + 0.05 * haze
+    r, g, b = 0.22 + 0.45 * haze, 0.40 + 0.32 * haze, 0.75 + 0.05 * haze
     return r + cloud * (0.85 - r), g + cloud * (0.85 - g), b + cloud * (0.87 - b)
 
 
-@njit
+@inline
+def _mirrored(texels: I32, start: I64, row: F32, d: Vector, facing: float, gloss: float) -> tuple[float, Vector]:  # fmt: skip
+    """Share and light of what a glossy surface mirrors: the sky, or a dark street below the horizon."""
+    share = gloss + (1.0 - gloss) * (1.0 + max(facing, -1.0)) ** 5  # Schlick 1994
+    e = -2.0 * facing
+    q = (d[0] + e * row[0], d[1] + e * row[1], d[2] + e * row[2])
+    light = sky_colour(texels, start, q) if q[2] > 0.0 else (0.10, 0.10, 0.10)
+    return min(share, 0.5), light
+
+
+@inline
 def shade(
-    t: int,
-    o: F64,
-    d: tuple[float, float, float],
-    pixel: float,
-    plane: F32,
-    uv: F32,
-    texels_per_m: F32,
-    shift: F32,
-    material: np.ndarray,  # type: ignore[type-arg]
-    tint: U8,
-    texels: U8,
-    start: np.ndarray,  # type: ignore[type-arg]
-    metres: F32,
-    gloss: F32,
-    shadow: F32,
-    shadow_rows: F32,
-    sun: F32,
-) -> tuple[float, float, float]:
-    """Linear light 0..~1.5 from triangle ``t`` along the ray o + s d (local frame); ``pixel`` is its width in
-    radians.
+    row: F32, look: U8, o: F64, d: Vector, pixel: float, texels: I32, start: I64, metres: F32, gloss: F32, shadow: F32, shadow_rows: F32, sun: F32
+) -> Vector:  # fmt: skip
+    """Linear light 0..~1.5 from the triangle of ``row`` and ``look`` (see Surface) along the ray o + s d.
+
+    ``pixel`` is the width of the pixel in radians.
     """
-    n0, n1, n2 = plane[t, 0], plane[t, 1], plane[t, 2]
-    facing = n0 * d[0] + n1 * d[1] + n2 * d[2]
-    s = (plane[t, 3] - (n0 * o[0] + n1 * o[1] + n2 * o[2])) / min(facing, -1e-4)
+    facing = row[0] * d[0] + row[1] * d[1] + row[2] * d[2]
+    s = (row[3] - (row[0] * o[0] + row[1] * o[1] + row[2] * o[2])) / min(facing, -1e-4)
     x, y, z = o[0] + s * d[0], o[1] + s * d[1], o[2] + s * d[2]
-    u = uv[t, 0, 0] * x + uv[t, 0, 1] * y + uv[t, 0, 2] * z + uv[t, 0, 3]
-    v = uv[t, 1, 0] * x + uv[t, 1, 1] * y + uv[t, 1, 2] * z + uv[t, 1, 3]
+    u = row[4] * x + row[5] * y + row[6] * z + row[7]
+    v = row[8] * x + row[9] * y + row[10] * z + row[11]
     # width of the pixel on the surface: between its short and its long axis
     width = s * pixel / np.sqrt(max(-facing, 0.02))
-    m = material[t]
-    lod = np.log2(max(width * texels_per_m[t], 1e-6))
-    r, g, b = sample(texels, start, metres, m, u, v, lod)
-    slow_lod = np.log2(max(width * (SIZE / _MACRO_SPAN_M), 1e-6))
-    slow, _, _ = sample(texels, start, metres, 0, u + shift[t, 0], v + shift[t, 1], slow_lod)
-    k = slow / (217.0 * 255.0 * 255.0)
-    r, g, b = r * k * tint[t, 0], g * k * tint[t, 1], b * k * tint[t, 2]
-    direct = n0 * sun[0] + n1 * sun[1] + n2 * sun[2]
+    m = look[3]
+    r, g, b = sample(texels, start, metres, m, u, v, np.log2(max(width * row[12], 1e-6)))
+    slow_lod = 0.0 if width < MACRO_M / SIZE else np.log2(width * (SIZE / MACRO_M))
+    slow = sample_slow(texels, start, u + row[13], v + row[14], slow_lod)
+    k = slow / (_MACRO_MEAN * 255.0 * 255.0)
+    r, g, b = r * k * look[0], g * k * look[1], b * k * look[2]
+    direct = max(row[0] * sun[0] + row[1] * sun[1] + row[2] * sun[2], 0.0)
     if direct > 0.0:
         direct *= _sunlit(shadow, shadow_rows, x, y, z)
-    direct = max(direct, 0.0)
-    sky = 0.62 + 0.38 * n2
-    r, g, b = r * r, g * g, b * b
-    r *= _SUN[0] * direct + _SKY[0] * sky
-    g *= _SUN[1] * direct + _SKY[1] * sky
-    b *= _SUN[2] * direct + _SKY[2] * sky
+    sky = 0.62 + 0.38 * row[2]
+    r *= r * (_SUN[0] * direct + _SKY[0] * sky)
+    g *= g * (_SUN[1] * direct + _SKY[1] * sky)
+    b *= b * (_SUN[2] * direct + _SKY[2] * sky)
     if gloss[m] > 0.0:
-        mirror = gloss[m] + (1.0 - gloss[m]) * (1.0 + max(facing, -1.0)) ** 5  # Schlick 1994
-        mirror = min(mirror * 1.0, 0.6) if gloss[m] > 0.1 else gloss[m]
-        e = -2.0 * facing
-        dz = d[2] + e * n2
-        if dz > 0.0:
-            q = sky_colour(texels, start, metres, d[0] + e * n0, d[1] + e * n1, dz)
-        else:
-            q = (0.10, 0.10, 0.10)
-        r, g, b = r + mirror * (q[0] - r), g + mirror * (q[1] - g), b + mirror * (q[2] - b)
+        share, q = _mirrored(texels, start, row, d, facing, gloss[m])
+        r, g, b = r + share * (q[0] - r), g + share * (q[1] - g), b + share * (q[2] - b)
     return r, g, b
+
+
+@inline
+def _direction(R: F64, x: float, y: float) -> Vector:
+    """Unit direction in the world of the camera's line (x, y, 1)."""
+    inv = 1.0 / np.sqrt(x * x + y * y + 1.0)
+    return (
+        (R[0, 0] * x + R[0, 1] * y + R[0, 2]) * inv,
+        (R[1, 0] * x + R[1, 1] * y + R[1, 2]) * inv,
+        (R[2, 0] * x + R[2, 1] * y + R[2, 2]) * inv,
+    )
 
 
 @njit
 def _pixels(
-    ids: I32, lines: F32, canvas: I32, R: F64, o: F64, pixel: float, plane: F32, uv: F32, texels_per_m: F32, shift: F32,
-    material: np.ndarray, tint: U8, texels: U8, start: np.ndarray, metres: F32, gloss: F32, shadow: F32, shadow_rows: F32, sun: F32, out: F32,  # type: ignore[type-arg]
+    ids: I32, lines: F32, canvas: I32, R: F64, o: F64, pixel: float, rows: F32, look: U8, key: U32, texels: I32, start: I64, metres: F32, gloss: F32, shadow: F32, shadow_rows: F32, sun: F32, out: F32
 ) -> None:  # fmt: skip
-    """Mean light of four sub-pixels; one shading where all four see the same triangle."""
-    height, width = out.shape[:2]
-    for row in range(height):
-        for column in range(width):
-            first = ids[canvas[row, column, 0]]
-            same = True
-            for k in range(1, 4):
-                same = same and ids[canvas[row, column, k]] == first
-            r, g, b = 0.0, 0.0, 0.0
-            count = 1 if same else 4
-            for k in range(count):
-                j = 4 if same else k  # line 4 is the middle of the pixel
-                lx, ly = lines[row, column, j, 0], lines[row, column, j, 1]
-                inv = 1.0 / np.sqrt(lx * lx + ly * ly + 1.0)
-                lx, ly = lx * inv, ly * inv
-                d = (
-                    R[0, 0] * lx + R[0, 1] * ly + R[0, 2] * inv,
-                    R[1, 0] * lx + R[1, 1] * ly + R[1, 2] * inv,
-                    R[2, 0] * lx + R[2, 1] * ly + R[2, 2] * inv,
-                )
-                t = first if same else ids[canvas[row, column, k]]
-                if t < 0:
-                    c = sky_colour(texels, start, metres, d[0], d[1], d[2])
-                else:
-                    c = shade(t, o, d, pixel if same else 0.5 * pixel, plane, uv, texels_per_m, shift, material, tint, texels, start, metres, gloss, shadow, shadow_rows, sun)  # fmt: skip
-                r, g, b = r + c[0], g + c[1], b + c[2]
-            out[row, column, 0], out[row, column, 1], out[row, column, 2] = r / count, g / count, b / count
+    """Mean light of four sub-pixels; one shading where all four see the same surface."""
+    for i in range(len(canvas)):
+        first = ids[canvas[i, 0]]
+        same = True
+        for k in range(1, 4):
+            t = ids[canvas[i, k]]
+            same = same and (t == first or (t >= 0 and first >= 0 and key[t] == key[first]))
+        r, g, b = 0.0, 0.0, 0.0
+        count = 1 if same else 4
+        for k in range(count):
+            j = 4 if same else k  # line 4 is the middle of the pixel
+            d = _direction(R, lines[i, j, 0], lines[i, j, 1])
+            t = ids[canvas[i, k]]
+            if t < 0:
+                c = sky_colour(texels, start, d)
+            else:
+                width = pixel if same else 0.5 * pixel
+                c = shade(rows[t], look[t], o, d, width, texels, start, metres, gloss, shadow, shadow_rows, sun)  # fmt: skip
+            r, g, b = r + c[0], g + c[1], b + c[2]
+        out[i, 0], out[i, 1], out[i, 2] = r / count, g / count, b / count
 
 
 def shade_image(
@@ -238,13 +245,9 @@ def shade_image(
     middle; ``pixel`` its width in radians.
     """
     s, a = scene.surface, scene.atlas
-    out = np.empty((*canvas.shape[:2], 3), np.float32)
+    height, width = canvas.shape[:2]
+    out = np.empty((height * width, 3), np.float32)
     o = T_world_cam[:3, 3] - scene.origin
     R = np.ascontiguousarray(T_world_cam[:3, :3])
-    _pixels(ids.reshape(-1), lines, canvas, R, o, pixel, s.plane, s.uv, s.texels_per_m, s.shift, s.material, s.tint, a.texels, a.start, a.metres, a.gloss, shadow.depth, shadow.rows, shadow.sun, out)  # fmt: skip
-    return out
-
-
-def picture_luma(atlas: TextureAtlas, material: int) -> float:
-    """Mean brightness 0..255 of a material's picture."""
-    return float(atlas.mean_luma[material])
+    _pixels(ids.reshape(-1), lines.reshape(-1, 5, 2), canvas.reshape(-1, 4), R, o, pixel, s.rows, s.look, s.key, a.texels, a.start, a.metres, a.gloss, shadow.depth, shadow.rows, shadow.sun, out)  # fmt: skip
+    return out.reshape(height, width, 3)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_drivers.virtual.mesh_builder import F32, F64, U8
+from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
 
 Rng = np.random.Generator
 SIZE = 512  # pixels of a material's picture, power of two
@@ -25,19 +25,20 @@ ROAD_SIGNS = 5
 PLATES = 6
 #: Material of slow brightness changes, always index 0.
 MACRO = 0
+MACRO_M = 11.3  # its width in metres
 
 
 @dataclass(frozen=True, slots=True)
 class TextureAtlas:
     """All materials of a world as flat arrays.
 
-    ``texels`` uint8 (n, 3) RGB; ``start`` int64 (materials, LEVELS) first texel of a mip level (square pictures
+    ``texels`` int32 (n,) red, green << 8, blue << 16; ``start`` int64 (materials, LEVELS) first texel of a mip level (square pictures
     of SIZE >> level pixels); ``metres`` float32 (materials,) width of a picture; ``reflectivity`` float32 0..1 at
     905 nm and ``gloss`` float32 0..1 share of mirrored sky; ``mean_luma`` float32 mean brightness 0..255;
     ``index`` material number by name.
     """
 
-    texels: U8
+    texels: I32
     start: NDArray[np.int64]
     metres: F32
     reflectivity: F32
@@ -333,7 +334,7 @@ class _Recipe:
 
 def _recipes() -> dict[str, _Recipe]:
     recipes = {
-        "macro": _Recipe(_macro, 11.3, 0.0),
+        "macro": _Recipe(_macro, MACRO_M, 0.0),
         "asphalt": _Recipe(_asphalt, 1.6, 0.15),
         "lane_paint": _Recipe(_worn_paint, 1.6, 0.5),
         "paving": _Recipe(lambda r: _masonry(r, 4, 4, 7, 0.09, 0.35, False), 1.6, 0.3),
@@ -350,8 +351,8 @@ def _recipes() -> dict[str, _Recipe]:
         "door": _Recipe(_door, 1.0, 0.4),
         "shutter": _Recipe(_shutter, 2.0, 0.4, 0.05),
         "metal": _Recipe(_metal, 0.6, 0.4, 0.08),
-        "car_paint": _Recipe(_paint, 1.7, 0.35, 0.16),
-        "glass": _Recipe(_glass, 1.3, 0.08, 0.4),
+        "car_paint": _Recipe(_paint, 1.7, 0.35, 0.1),
+        "glass": _Recipe(_glass, 1.3, 0.08, 0.22),
         "rubber": _Recipe(_plastic, 0.4, 0.06),
         "plastic": _Recipe(_plastic, 0.5, 0.35, 0.05),
         "bark": _Recipe(_bark, 0.7, 0.35),
@@ -362,7 +363,7 @@ def _recipes() -> dict[str, _Recipe]:
         "lamp": _Recipe(lambda r: _tinted(0.9 + 0.05 * fractal(r, (8, 40)), (1, 0.98, 0.9)), 0.4, 0.3, 0.2),
     }
     for k in range(4):
-        recipes[f"window_{k}"] = _Recipe(_window, 1.0, 0.1, 0.3)
+        recipes[f"window_{k}"] = _Recipe(_window, 1.0, 0.1, 0.12)
     for k in range(SHOP_SIGNS):
         recipes[f"shop_sign_{k}"] = _Recipe(_shop_sign, 1.0, 0.5)
     for k in range(ROAD_SIGNS):
@@ -372,10 +373,15 @@ def _recipes() -> dict[str, _Recipe]:
     return recipes
 
 
+def _packed(picture: U8) -> I32:
+    r, g, b = np.moveaxis(picture.reshape(-1, 3).astype(np.int32), 1, 0)
+    return np.asarray(r | g << 8 | b << 16, np.int32)
+
+
 def build_atlas(seed: int) -> TextureAtlas:
     """All materials drawn from ``seed``; the same seed gives the same bytes."""
     recipes = _recipes()
-    levels: list[U8] = []
+    levels: list[I32] = []
     start = np.empty((len(recipes), LEVELS), np.int64)
     luma = np.empty(len(recipes), np.float32)
     count = 0
@@ -385,7 +391,7 @@ def build_atlas(seed: int) -> TextureAtlas:
         luma[m] = picture.mean()
         for level in range(LEVELS):
             start[m, level] = count
-            levels.append(picture.reshape(-1, 3))
+            levels.append(_packed(picture))
             count += len(levels[-1])
             half = picture.shape[0] // 2
             picture = cv2.resize(picture, (half, half), interpolation=cv2.INTER_AREA)
