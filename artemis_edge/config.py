@@ -27,7 +27,9 @@ def _float(text: str, *, ge: float | None = None, gt: float | None = None, le: f
 class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """LiDAR odometry, used when no poses are given (section III-A of the paper, odometry/)."""
 
-    voxel_m: Annotated[float, _float("Edge of the finest voxel that holds a plane, m.", ge=0.05, le=5.0)] = 0.5
+    voxel_m: Annotated[float, _float("Edge of the finest voxel that holds a plane, m.", ge=0.05, le=5.0)] = (
+        0.5
+    )
     levels: Annotated[int, Meta(description="Sizes of voxel planes, each twice the last.", ge=1, le=6)] = 4
     max_voxels: Annotated[
         int, Meta(description="Voxels of all sizes in the local map; about 250 bytes each.", ge=10_000)
@@ -39,7 +41,8 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
         int, Meta(description="Points of a scan that are registered, about; more are slower.", ge=200)
     ] = 4000
     min_range_m: Annotated[
-        float, _float("Nearer points belong to the operator or the vehicle and are not registered, m.", ge=0.0)
+        float,
+        _float("Nearer points belong to the operator or the vehicle and are not registered, m.", ge=0.0),
     ] = 0.5
     max_range_m: Annotated[
         float, _float("Farther points are not registered, and farther voxels are forgotten, m.", gt=1.0)
@@ -59,6 +62,9 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     start_turn: Annotated[
         float, _float("How fast the sensor may already turn when the recording starts, rad/s.", gt=0.0)
     ] = 0.5
+    gyro_sigma: Annotated[float, _float("Error of the gyroscope's rate, bias included, rad/s.", gt=0.0)] = (
+        0.02
+    )
 
 
 class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -74,14 +80,17 @@ class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
     lidar_topics: Annotated[
         tuple[str, ...],
-        Meta(description="Cloud topics, the primary LiDAR first; empty: one for each LiDAR frame of the bag."),
+        Meta(
+            description="Cloud topics, the primary LiDAR first; empty: one for each LiDAR frame of the bag."
+        ),
     ] = ()
     image_topics: Annotated[
         tuple[str, ...], Meta(description="Image topics; empty: one for each camera frame of the bag.")
     ] = ()
     imu_topic: Annotated[str, Meta(description="IMU topic; empty: the first by name.")] = ""
     odometry_topic: Annotated[
-        str, Meta(description="Odometry topic whose poses are used where tf has none; empty: the first by name.")
+        str,
+        Meta(description="Odometry topic whose poses are used where tf has none; empty: the first by name."),
     ] = ""
 
 

@@ -1,4 +1,4 @@
-"""Eigenvalues and eigenvectors of a symmetric 3 x 3 matrix, without a call to LAPACK (0.4 us against 3 us)."""
+"""Eigenvalues and eigenvectors of a symmetric 3 x 3 matrix, without LAPACK (0.4 us against 3 us)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SWEEPS = 6  # cyclic Jacobi converges quadratically; six sweeps reach rounding 
 
 @njit
 def eigh3(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> tuple[F64, F64]:
-    """Ascending eigenvalues (3,) and eigenvectors as columns (3, 3), by cyclic Jacobi (Golub, Van Loan 8.5)."""
+    """Ascending eigenvalues (3,) and eigenvectors as columns (3, 3), by Jacobi (Golub, Van Loan 8.5)."""
     A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     V = np.eye(3)
     for _ in range(_SWEEPS):

@@ -1,9 +1,9 @@
 """The local map of the odometry: planes in voxels of several sizes, bounded in memory.
 
-Every voxel keeps running moments of its points; a plane is fitted when it is asked for and its voxel has changed
-enough. Planes of voxels replace the k nearest neighbours of other methods at a third to a fifth of the cost, and
-the moments give the plane's own uncertainty (the idea of Yuan et al., VoxelMap, RA-L 2022; used here is the
-prediction variance of a linear regression).
+Every voxel keeps running moments of its points; a plane is fitted when it is asked for and its voxel has
+changed enough. Planes of voxels replace the k nearest neighbours of other methods at a third to a fifth of
+the cost, and the moments give the plane's own uncertainty (the idea of Yuan et al., VoxelMap, RA-L 2022;
+used here is the prediction variance of a linear regression).
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from artemis_edge._jit import inline, njit
 from artemis_edge.frames import F32, F64, I64, Bool
 from artemis_edge.odometry.eigen3 import eigh3
 
-EMPTY = np.int64(-1)
+EMPTY = -1
 _AXIS_BITS = 20  # +-2^19 voxels of 0.5 m are +-262 km
 _HALF = 1 << (_AXIS_BITS - 1)
 _AXIS_MASK = (1 << _AXIS_BITS) - 1
-_MIX = np.int64(0x9E3779B97F4A7C15 - (1 << 64))  # 2^64 / golden ratio spreads neighbouring keys (Knuth 6.4)
+_MIX = 0x9E3779B97F4A7C15 - (1 << 64)  # 2^64 / golden ratio spreads neighbouring keys (Knuth 6.4)
 
 MIN_POINTS = 6  # three define a plane, three more say how well
 _MAX_POINTS = 400.0  # then the moments are halved: the map follows a scene that changes
@@ -29,13 +29,13 @@ _MAX_THICKNESS = 0.1  # smallest / middle eigenvalue: a plane is at least three 
 _SHRINK = 0.8  # radius kept when the map is full is shortened by this until half the slots are free
 
 
-# Columns of a row: what registration reads first, so that it touches two cache lines of a voxel.
-COUNT = 0  # points
-FITTED = 1  # points at the last fit
-THICKNESS = 2  # variance of the plane along its normal, m2; negative: no plane
-NORMAL = 3  # unit vector, 3
-CENTRE = 6  # world, m, 3
-SPREAD = 9  # inverse in-plane covariance xx xy xz yy yz zz, 1/m2, 6
+# Columns of a row; what registration reads comes first.
+FITTED = 0  # points at the last fit
+THICKNESS = 1  # variance of the plane along its normal, m2; negative: no plane
+NORMAL = 2  # unit vector, 3
+CENTRE = 5  # world, m, 3
+SPREAD = 8  # inverse in-plane covariance xx xy xz yy yz zz, 1/m2, 6
+COUNT = 14  # points
 MOMENTS = 15  # sums of x y z xx xy xz yy yz zz about the voxel's lower corner, m and m2, 9
 _COLUMNS = 24
 
@@ -43,20 +43,13 @@ _COLUMNS = 24
 class Table(NamedTuple):
     """Arrays of the map, as kernels take them.
 
-    ``hash`` int64 (2^k, 2) is an open-addressing hash of key and slot, ``keys`` int64 (capacity,) the key of each
-    slot, ``rows`` float64 (capacity, 24) its voxel: the columns above.
+    ``hash`` int64 (2^k, 2) is an open-addressing hash of key and slot, ``keys`` int64 (capacity,) the key
+    of each slot, ``rows`` float64 (capacity, 24) its voxel: the columns above.
     """
 
     hash: I64
     keys: I64
     rows: F64
-
-
-def _table(capacity: int) -> Table:
-    size = 1 << (2 * capacity - 1).bit_length()
-    return Table(
-        np.full((size, 2), EMPTY), np.empty(capacity, np.int64), np.empty((capacity, _COLUMNS))
-    )
 
 
 class PlaneMap:
@@ -66,22 +59,31 @@ class PlaneMap:
         self.voxel_m = voxel_m
         self.levels = levels
         self.capacity = capacity
-        self.clear()
+        self.table = Table(empty_hash(capacity), np.empty(capacity, np.int64), np.empty((capacity, _COLUMNS)))
+        self._used = 0
 
     def __len__(self) -> int:
         return self._used
 
     def clear(self) -> None:
         """Forget everything."""
-        self.table = _table(self.capacity)
+        self.table.hash.fill(EMPTY)
         self._used = 0
 
     def insert(self, points: F32, T_world_lidar: F64) -> int:
-        """Add points float32 (n, 3) of the lidar frame; returns how many found no room (see ``evict``)."""
-        self._used, refused = insert(
-            self.table, self._used, points, T_world_lidar, self.voxel_m, self.levels
-        )
-        return int(refused)
+        """Add points float32 (n, 3) of the lidar frame; returns how many found no room (see ``evict``).
+
+        The scan is first summed into its own cells, whose sums go to the map and then into cells of twice the
+        size: a fifth of the look-ups in the large table.
+        """
+        refused = 0
+        cells, sums = sum_points(points, T_world_lidar, self.voxel_m)
+        for level in range(self.levels):
+            if level:
+                cells, sums = coarsen(cells, sums, self.voxel_m * (1 << (level - 1)))
+            self._used, left_out = add_cells(self.table, self._used, level, cells, sums)
+            refused = max(refused, int(left_out))
+        return refused
 
     def evict(self, centre: F64, radius_m: float) -> None:
         """Forget voxels farther than the radius from a place in world, farther still until half is free."""
@@ -93,15 +95,15 @@ class PlaneMap:
             self.table.hash.fill(EMPTY)
             self._used = int(compact(self.table, keep))
 
-    def kernel_view(self, voxel_m: float) -> tuple[Table, float, int, int]:
-        """Arguments of a kernel that looks planes up: the table, its sizes, the finest level not below a size."""
-        finest = 0
-        while finest < self.levels - 1 and self.voxel_m * (1 << finest) < voxel_m:
-            finest += 1
-        return self.table, self.voxel_m, self.levels, finest
+    def level_of(self, size_m: float) -> int:
+        """The finest level whose voxels are not smaller than a size, or the coarsest."""
+        level = 0
+        while level < self.levels - 1 and self.voxel_m * (1 << level) < size_m:
+            level += 1
+        return level
 
     def planes(self, level: int) -> tuple[F64, F64, F64]:
-        """Normals (n, 3), centres (n, 3) and thickness variances (n,) of one level's planes, for inspection."""
+        """Normals (n, 3), centres (n, 3) and thickness variances (n,) of the planes of a level."""
         fit_all(self.table, self._used, self.voxel_m)
         rows = self.table.rows[: self._used][self.table.keys[: self._used] >> (3 * _AXIS_BITS) == level]
         rows = rows[rows[:, THICKNESS] >= 0.0]
@@ -109,10 +111,17 @@ class PlaneMap:
 
 
 @inline
+def cell_key(level: int, x: int, y: int, z: int) -> int:
+    """Key of the voxel (x, y, z) of a level, counted in voxels of that level."""
+    upper = ((level << _AXIS_BITS) | (x + _HALF)) << _AXIS_BITS
+    return ((upper | (y + _HALF)) << _AXIS_BITS) | (z + _HALF)
+
+
+@inline
 def voxel_key(level: int, x: int, y: int, z: int) -> int:
     """Key of the voxel of a level that holds the finest voxel (x, y, z)."""
-    upper = ((level << _AXIS_BITS) | ((x >> level) + _HALF)) << _AXIS_BITS
-    return ((upper | ((y >> level) + _HALF)) << _AXIS_BITS) | ((z >> level) + _HALF)
+    key: int = cell_key(level, x >> level, y >> level, z >> level)
+    return key
 
 
 @njit
@@ -123,6 +132,15 @@ def _corner(key: int, voxel_m: float) -> tuple[float, float, float]:
     y = ((key >> _AXIS_BITS) & _AXIS_MASK) - _HALF
     z = (key & _AXIS_MASK) - _HALF
     return x * size, y * size, z * size
+
+
+@njit
+def empty_hash(entries: int) -> I64:
+    """An open-addressing hash int64 (2^k, 2) of key and value, at most half full with so many entries."""
+    size = 1
+    while size < 2 * entries:
+        size *= 2
+    return np.full((size, 2), EMPTY)
 
 
 @njit
@@ -137,42 +155,10 @@ def probe(table: I64, key: int) -> int:
 
 
 @njit
-def insert(
-    table: Table, used: int, points: F32, T_world_lidar: F64, voxel_m: float, levels: int
-) -> tuple[int, int]:
-    """Add points to the moments of their voxels at all levels; returns slots used and points refused.
-
-    The scan is first summed into its own finest voxels, whose sums then go to the map: a fifth of the look-ups.
-    """
-    cells, sums = _sum_cells(points, T_world_lidar, voxel_m)
-    refused = 0
-    for i in range(len(cells)):
-        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-        for level in range(levels):
-            key = voxel_key(level, x, y, z)
-            place = probe(table.hash, key)
-            if table.hash[place, 0] == EMPTY:
-                if used == len(table.rows):
-                    refused += int(sums[i, 0])
-                    break
-                table.hash[place, 0], table.hash[place, 1], table.keys[used] = key, used, key
-                table.rows[used] = 0.0
-                table.rows[used, THICKNESS] = -1.0
-                used += 1
-            cx, cy, cz = _corner(key, voxel_m)
-            row = table.rows[table.hash[place, 1]]
-            _add(row, sums[i], x * voxel_m - cx, y * voxel_m - cy, z * voxel_m - cz)
-    return used, refused
-
-
-@njit
-def _sum_cells(points: F32, T_world_lidar: F64, voxel_m: float) -> tuple[I64, F64]:
-    """Cells int64 (m, 3) that a scan touches, and (m, 10) count and moments of its points about their corners."""
+def sum_points(points: F32, T_world_lidar: F64, voxel_m: float) -> tuple[I64, F64]:
+    """Finest cells int64 (m, 3) touched in world, with count and moments (m, 10) about their corners."""
     T, n, inverse = T_world_lidar, 0, 1.0 / voxel_m
-    size = 1
-    while size < 2 * len(points):
-        size *= 2
-    table = np.full((size, 2), EMPTY)
+    table = empty_hash(len(points))
     cells, sums = np.empty((len(points), 3), np.int64), np.empty((len(points), 10))
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -180,7 +166,7 @@ def _sum_cells(points: F32, T_world_lidar: F64, voxel_m: float) -> tuple[I64, F6
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         ix, iy, iz = int(np.floor(x * inverse)), int(np.floor(y * inverse)), int(np.floor(z * inverse))
-        key = voxel_key(0, ix, iy, iz)
+        key = cell_key(0, ix, iy, iz)
         place = probe(table, key)
         if table[place, 0] == EMPTY:
             table[place, 0], table[place, 1] = key, n
@@ -203,24 +189,62 @@ def _sum_cells(points: F32, T_world_lidar: F64, voxel_m: float) -> tuple[I64, F6
 
 
 @njit
-def _add(row: F64, s: F64, dx: float, dy: float, dz: float) -> None:
-    """Add a cell's sums to a voxel whose corner lies (dx, dy, dz) below the cell's."""
-    if row[COUNT] >= _MAX_POINTS:
-        row[COUNT] *= 0.5
-        row[FITTED] *= 0.5
-        row[MOMENTS:] *= 0.5
+def coarsen(cells: I64, sums: F64, size_m: float) -> tuple[I64, F64]:
+    """Cells of twice the size, and their sums; ``size_m`` is the edge of the given cells."""
+    n = 0
+    table = empty_hash(len(cells))
+    out_cells, out = np.empty((len(cells), 3), np.int64), np.empty((len(cells), 10))
+    for i in range(len(cells)):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        key = voxel_key(1, x, y, z)
+        place = probe(table, key)
+        if table[place, 0] == EMPTY:
+            table[place, 0], table[place, 1] = key, n
+            out_cells[n, 0], out_cells[n, 1], out_cells[n, 2] = x >> 1, y >> 1, z >> 1
+            out[n] = 0.0
+            n += 1
+        _add_shifted(out[table[place, 1]], sums[i], (x & 1) * size_m, (y & 1) * size_m, (z & 1) * size_m)
+    return out_cells[:n], out[:n]
+
+
+@njit
+def _add_shifted(m: F64, s: F64, dx: float, dy: float, dz: float) -> None:
+    """Add sums (10,) to others about a corner that lies (dx, dy, dz) lower."""
     n, x, y, z = s[0], s[1], s[2], s[3]
-    row[COUNT] += n
-    m = row[MOMENTS:]
-    m[0] += x + n * dx
-    m[1] += y + n * dy
-    m[2] += z + n * dz
-    m[3] += s[4] + (2.0 * x + n * dx) * dx
-    m[4] += s[5] + x * dy + y * dx + n * dx * dy
-    m[5] += s[6] + x * dz + z * dx + n * dx * dz
-    m[6] += s[7] + (2.0 * y + n * dy) * dy
-    m[7] += s[8] + y * dz + z * dy + n * dy * dz
-    m[8] += s[9] + (2.0 * z + n * dz) * dz
+    m[0] += n
+    m[1] += x + n * dx
+    m[2] += y + n * dy
+    m[3] += z + n * dz
+    m[4] += s[4] + (2.0 * x + n * dx) * dx
+    m[5] += s[5] + x * dy + y * dx + n * dx * dy
+    m[6] += s[6] + x * dz + z * dx + n * dx * dz
+    m[7] += s[7] + (2.0 * y + n * dy) * dy
+    m[8] += s[8] + y * dz + z * dy + n * dy * dz
+    m[9] += s[9] + (2.0 * z + n * dz) * dz
+
+
+@njit
+def add_cells(table: Table, used: int, level: int, cells: I64, sums: F64) -> tuple[int, int]:
+    """Add the sums of cells to their voxels; returns slots used and points refused for want of room."""
+    refused = 0
+    for i in range(len(cells)):
+        key = cell_key(level, cells[i, 0], cells[i, 1], cells[i, 2])
+        place = probe(table.hash, key)
+        if table.hash[place, 0] == EMPTY:
+            if used == len(table.rows):
+                refused += int(sums[i, 0])
+                continue
+            table.hash[place, 0], table.hash[place, 1], table.keys[used] = key, used, key
+            table.rows[used] = 0.0
+            table.rows[used, THICKNESS] = -1.0
+            used += 1
+        row = table.rows[table.hash[place, 1]]
+        if row[COUNT] >= _MAX_POINTS:
+            row[COUNT:] *= 0.5
+            row[FITTED] *= 0.5
+        for k in range(10):
+            row[COUNT + k] += sums[i, k]
+    return used, refused
 
 
 @njit
@@ -229,7 +253,7 @@ def refresh(table: Table, slot: int, voxel_m: float) -> bool:
     n = table.rows[slot, COUNT]
     if n >= MIN_POINTS and n >= _REFIT_GROWTH * table.rows[slot, FITTED]:
         _fit(table.rows[slot], table.keys[slot], voxel_m)
-    return table.rows[slot, THICKNESS] >= 0.0
+    return bool(table.rows[slot, THICKNESS] >= 0.0)
 
 
 @njit
@@ -274,7 +298,7 @@ def nearby(keys: I64, centre: F64, radius_m: float, voxel_m: float) -> Bool:
 
 @njit
 def compact(table: Table, keep: Bool) -> int:
-    """Move the kept slots to the front, in order, and enter them into the emptied hash; returns slots used."""
+    """Move the kept slots to the front, in order, and refill the emptied hash; returns slots used."""
     used = 0
     for slot in range(len(keep)):
         if keep[slot]:

@@ -1,12 +1,13 @@
-"""Point-to-plane registration of a thinned scan against the plane map: one linearisation, compiled.
+"""Point-to-plane registration of a thinned scan against the plane map.
 
-The residual of point p is r = n . (T p - c) with variance
+The residual of point p with plane (n, c) is r = n . (T p - c); its variance
 
-    s^2 = sigma^2 + tau^2 + t (1 + (1 + d' M d) / n)
+    s^2 = sigma^2 + tau^2 + t (1 + (1 + d' M d) / k)
 
-sensor noise sigma, expected misalignment tau of the present guess, thickness t of the plane and the prediction
-variance of a plane fitted to n points at the in-plane place d (M: inverse in-plane covariance). A point whose fine
-voxel has no plane, or none within three deviations, asks the coarser ones.
+has the noise sigma of a point, the misalignment tau still expected, the thickness t of the plane and the
+prediction variance of a plane fitted to k points at the in-plane place d (M: inverse in-plane covariance),
+so that the edge of a half-seen plane counts little and a plane of three scan lines counts little across
+them. A point whose fine voxel has no plane within three deviations asks the coarser voxels.
 """
 
 from __future__ import annotations
@@ -19,26 +20,51 @@ from artemis_edge._jit import njit
 from artemis_edge.frames import F32, F64
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.motion import Motion, Prediction
-from artemis_edge.odometry.plane_map import CENTRE, COUNT, NORMAL, SPREAD, THICKNESS, PlaneMap, Table, probe, refresh, voxel_key
+from artemis_edge.odometry.plane_map import (
+    CENTRE,
+    COUNT,
+    NORMAL,
+    SPREAD,
+    THICKNESS,
+    PlaneMap,
+    Table,
+    probe,
+    refresh,
+    voxel_key,
+)
 from artemis_edge.odometry.thin import TimedPoints
 
-_GATE2 = 9.0  # three standard deviations
-_KERNEL2 = 4.0  # Geman-McClure: a residual of two deviations has a quarter of the weight
-
-
+DEGENERATE = 0.01  # smallest eigenvalue of the mean of n n' below which a direction counts as not observed
 _PASSES = 2  # the motion within the scan is corrected anew after the first
 _ITERATIONS = 12
-_CONVERGED_M = 1e-3  # mean displacement of the points by a step
-DEGENERATE = 0.01  # smallest eigenvalue of the mean of n n' below which a direction counts as not observed
+_CONVERGED_M = 1e-3  # mean displacement of the points by a step; a thirtieth of their noise
+_REMATCH = 0.05  # displacement, as a share of the voxel in use, after which planes are looked up again
+_GATE2 = 9.0  # three deviations
+_KERNEL2 = 4.0  # Geman-McClure: a residual of two deviations has a quarter of the weight
+_MATCH_COLUMNS = 8  # point in the lidar frame (3), normal (3), n . c (1), variance of the plane there (1)
 
 
 class Registration(NamedTuple):
-    """Outcome: pose, mean of n n' over the matches (lidar frame), their number, and the share explained 0..1."""
+    """Pose, mean of n n' over the matches (lidar frame), their number, share of the scan explained."""
 
     T_world_lidar: F64
     N: F64
     matches: int
     score: float
+
+
+class Linearised(NamedTuple):
+    """Normal equations of a right perturbation T exp(x): ``H`` (6, 6) x = -``g`` (6,).
+
+    ``N`` (3, 3) is the mean of n n' over the ``matches`` inliers in the lidar frame, ``weight`` the sum of
+    their robust weights 0..1.
+    """
+
+    H: F64
+    g: F64
+    N: F64
+    matches: int
+    weight: float
 
 
 def register(
@@ -52,103 +78,123 @@ def register(
 ) -> Registration:
     """Gauss-Newton from a guess T_world_lidar that is wrong by about ``tau_m`` at the points.
 
-    Starts on voxels twice as large as the misalignment and refines as the steps shrink. A direction that the
-    planes do not observe borrows the missing information from the prediction.
+    Starts on voxels twice as large as the misalignment and refines as the steps shrink.
     """
     T, arm = guess, arm_m(scan.points)
+    level, matched, moved = -1, np.empty((0, _MATCH_COLUMNS)), 0.0
     for _ in range(_PASSES):
         points = scan.at_stamp(motion.twist_to(T, prediction.elapsed_s))
+        stale = True
         for _ in range(_ITERATIONS):
-            lin = linearise(*plane_map.kernel_view(2.0 * tau_m), points, T, sigma_m**2 + tau_m**2)
-            x = _step(lin, T, prediction, sigma_m)
+            finest = plane_map.level_of(2.0 * tau_m)
+            if stale or finest != level or moved > _REMATCH * plane_map.voxel_m * 2**finest:
+                level, moved, stale = finest, 0.0, False
+                matched = match(plane_map, points, T, finest, sigma_m**2 + tau_m**2)
+            x = _step(linearise(matched, T, sigma_m**2 + tau_m**2), T, prediction, sigma_m)
             T = T @ se3.exp(x)
-            moved = float(np.linalg.norm(x[:3]) + arm * np.linalg.norm(x[3:]))
-            tau_m = min(0.5 * tau_m, moved)
-            if moved < _CONVERGED_M:
+            step = float(np.linalg.norm(x[:3]) + arm * np.linalg.norm(x[3:]))
+            moved, tau_m = moved + step, min(0.5 * tau_m, step)
+            if step < _CONVERGED_M and level == 0:
                 break
-    lin = linearise(*plane_map.kernel_view(0.0), points, T, sigma_m**2)
-    return Registration(T, lin.N, lin.matches, lin.score / max(len(points), 1))
+    return judge(plane_map, points, T, sigma_m)
 
 
-def _step(lin: Linearised, T: F64, prediction: Prediction, sigma_m: float) -> F64:
-    """Solve for the perturbation (6,), prior included."""
-    P = prediction.information()
-    values, vectors = np.linalg.eigh(lin.N)
-    lent = np.maximum(DEGENERATE - values, 0.0) * lin.matches / sigma_m**2
-    P[:3, :3] += (vectors * lent) @ vectors.T
-    off = se3.log(se3.inverse(prediction.T_world_lidar) @ T)
-    x: F64 = -np.linalg.solve(lin.H + P, lin.g + P @ off)
-    return x
+def judge(
+    plane_map: PlaneMap, points: F32, T_world_lidar: F64, sigma_m: float, finest: int = 0
+) -> Registration:
+    """How well points float32 (n, 3) at the stamp fit the map at a pose."""
+    lin = linearise(match(plane_map, points, T_world_lidar, finest, sigma_m**2), T_world_lidar, sigma_m**2)
+    return Registration(T_world_lidar, lin.N, lin.matches, lin.weight / max(len(points), 1))
+
+
+def match(plane_map: PlaneMap, points: F32, T_world_lidar: F64, finest: int, noise2: float) -> F64:
+    """Planes that explain points: (m, 8) rows as the kernels take them; ``noise2`` = sigma^2 + tau^2, m2."""
+    m: F64 = match_planes(
+        plane_map.table, plane_map.voxel_m, finest, plane_map.levels, points, T_world_lidar, noise2
+    )
+    return m
 
 
 def arm_m(points: F32) -> float:
     """Root mean square range of points, m: what a turn by one radian moves them by."""
-    return float(np.sqrt(np.mean(np.square(points, dtype=np.float64)) * 3.0)) if len(points) else 0.0
+    return float(np.sqrt(3.0 * np.mean(np.square(points, dtype=np.float64)))) if len(points) else 0.0
 
 
-class Linearised(NamedTuple):
-    """Normal equations of a right perturbation T exp(x): ``H`` (6, 6), ``g`` (6,), H x = -g.
+def _step(lin: Linearised, T_world_lidar: F64, prediction: Prediction, sigma_m: float) -> F64:
+    """Perturbation (6,) that solves the normal equations and the prior.
 
-    ``N`` (3, 3) is the mean of n n' over the matches in the lidar frame, ``matches`` their number, ``score`` the
-    sum of the robust weights 0..1: how much of the scan lies on the map.
+    A direction that the planes hardly observe borrows from the prediction what it lacks to the threshold:
+    otherwise the noise of the normals would hold the sensor still along a corridor.
     """
-
-    H: F64
-    g: F64
-    N: F64
-    matches: int
-    score: float
+    P = prediction.information()
+    values, vectors = np.linalg.eigh(lin.N)
+    lent = np.maximum(DEGENERATE - values, 0.0) * lin.matches / sigma_m**2
+    P[:3, :3] += (vectors * lent) @ vectors.T
+    off = se3.log(se3.inverse(prediction.T_world_lidar) @ T_world_lidar)
+    x: F64 = -np.linalg.solve(lin.H + P, lin.g + P @ off)
+    return x
 
 
 @njit
-def _match(
-    table: Table, voxel_m: float, levels: int, finest: int, x: float, y: float, z: float, noise2: float
-) -> tuple[int, float, float]:
-    """Slot of the plane that explains a point (or -1), the residual and its variance."""
-    ix, iy, iz = int(np.floor(x / voxel_m)), int(np.floor(y / voxel_m)), int(np.floor(z / voxel_m))
-    for level in range(finest, levels):
-        place = probe(table.hash, voxel_key(level, ix, iy, iz))
-        slot = table.hash[place, 1]
-        if slot < 0 or not refresh(table, slot, voxel_m):
-            continue
-        w = table.rows[slot]
-        dx, dy, dz = x - w[CENTRE], y - w[CENTRE + 1], z - w[CENTRE + 2]
-        r = w[NORMAL] * dx + w[NORMAL + 1] * dy + w[NORMAL + 2] * dz
-        k = SPREAD
-        spread = dx * (w[k] * dx + 2.0 * (w[k + 1] * dy + w[k + 2] * dz))
-        spread += dy * (w[k + 3] * dy + 2.0 * w[k + 4] * dz) + w[k + 5] * dz * dz
-        variance = noise2 + w[THICKNESS] * (1.0 + (1.0 + spread) / w[COUNT])
-        if r * r <= _GATE2 * variance:
-            return slot, r, variance
-    return -1, 0.0, 1.0
-
-
-@njit
-def linearise(
-    table: Table, voxel_m: float, levels: int, finest: int, points: F32, T: F64, noise2: float
-) -> Linearised:
-    """Robust normal equations of points float32 (n, 3) (lidar frame) at the guess T_world_lidar.
-
-    ``noise2`` is sigma^2 + tau^2 in m2; the kernel is Geman-McClure on the normalised residual.
-    """
-    H, g, N, matches, score = np.zeros((6, 6)), np.zeros(6), np.zeros((3, 3)), 0, 0.0
-    J = np.empty(6)
+def match_planes(
+    table: Table, voxel_m: float, finest: int, levels: int, points: F32, T_world_lidar: F64, noise2: float
+) -> F64:
+    """For each point the plane of the finest voxel that explains it; points without one are left out."""
+    T, inverse, n = T_world_lidar, 1.0 / voxel_m, 0
+    out = np.empty((len(points), _MATCH_COLUMNS))
     for i in range(len(points)):
         px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        slot, r, variance = _match(table, voxel_m, levels, finest, x, y, z, noise2)
-        if slot < 0:
-            continue
-        n = table.rows[slot, NORMAL : NORMAL + 3]
+        ix, iy, iz = int(np.floor(x * inverse)), int(np.floor(y * inverse)), int(np.floor(z * inverse))
+        for level in range(finest, levels):
+            slot = table.hash[probe(table.hash, voxel_key(level, ix, iy, iz)), 1]
+            if slot < 0 or not refresh(table, slot, voxel_m):
+                continue
+            w = table.rows[slot]
+            dx, dy, dz = x - w[CENTRE], y - w[CENTRE + 1], z - w[CENTRE + 2]
+            r = w[NORMAL] * dx + w[NORMAL + 1] * dy + w[NORMAL + 2] * dz
+            variance = w[THICKNESS] * (1.0 + (1.0 + _spread(w, dx, dy, dz)) / w[COUNT])
+            if r * r <= _GATE2 * (noise2 + variance):
+                o = out[n]
+                o[0], o[1], o[2] = px, py, pz
+                o[3], o[4], o[5] = w[NORMAL], w[NORMAL + 1], w[NORMAL + 2]
+                o[6] = o[3] * w[CENTRE] + o[4] * w[CENTRE + 1] + o[5] * w[CENTRE + 2]
+                o[7] = variance
+                n += 1
+                break
+    return out[:n]
+
+
+@njit
+def _spread(row: F64, dx: float, dy: float, dz: float) -> float:
+    """d' M d of the module's formula."""
+    m = row[SPREAD:]
+    x = m[0] * dx + 2.0 * (m[1] * dy + m[2] * dz)
+    y = m[3] * dy + 2.0 * m[4] * dz
+    return float(dx * x + dy * y + m[5] * dz * dz)
+
+
+@njit
+def linearise(matched: F64, T_world_lidar: F64, noise2: float) -> Linearised:
+    """Robust normal equations of matched planes (m, 8); matches beyond three deviations have no weight."""
+    T = T_world_lidar
+    H, g, N, matches, total = np.zeros((6, 6)), np.zeros(6), np.zeros((3, 3)), 0, 0.0
+    J = np.empty(6)
+    for i in range(len(matched)):
+        px, py, pz, n0, n1, n2, nc, variance = matched[i]
         for k in range(3):
-            J[k] = n[0] * T[0, k] + n[1] * T[1, k] + n[2] * T[2, k]
+            J[k] = n0 * T[0, k] + n1 * T[1, k] + n2 * T[2, k]
         J[3], J[4], J[5] = py * J[2] - pz * J[1], pz * J[0] - px * J[2], px * J[1] - py * J[0]
-        robust = (_KERNEL2 / (_KERNEL2 + r * r / variance)) ** 2
-        weight = robust / variance
+        r = J[0] * px + J[1] * py + J[2] * pz + n0 * T[0, 3] + n1 * T[1, 3] + n2 * T[2, 3] - nc
+        s2 = noise2 + variance
+        if r * r > _GATE2 * s2:
+            continue
+        robust = (_KERNEL2 / (_KERNEL2 + r * r / s2)) ** 2
+        weight = robust / s2
         matches += 1
-        score += robust
+        total += robust
         for a in range(6):
             g[a] += weight * r * J[a]
             for b in range(a, 6):
@@ -159,4 +205,4 @@ def linearise(
     for a in range(6):
         for b in range(a):
             H[a, b] = H[b, a]
-    return Linearised(H, g, N / max(matches, 1), matches, score)
+    return Linearised(H, g, N / max(matches, 1), matches, total)

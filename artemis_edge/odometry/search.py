@@ -1,8 +1,8 @@
 """Guesses around a prediction, for when the prediction may lie outside the reach of Gauss-Newton.
 
-A carried sensor at 2 Hz turns 40 deg between two scans; a car's first two scans lie a metre apart with nothing known
-of its speed. The score of a few hundred points on the coarse planes tells good guesses from bad ones (in the manner
-of Olson's correlative scan matching, ICRA 2009).
+A carried sensor at 2 Hz turns 40 deg between two scans; a car's first two scans lie a metre apart with
+nothing known of its speed. The score of a few hundred points on the coarse planes tells good guesses from
+bad ones (in the manner of Olson's correlative scan matching, ICRA 2009).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def ball(radius: float, spacing: float) -> F64:
 
 
 def guesses(T_world_lidar: F64, reach_m: float, reach_rad: float, arm_m: float, basin_m: float) -> list[F64]:
-    """Poses around a guess: shifted up to ``reach_m``, then turned up to ``reach_rad``; the guess itself first.
+    """Poses around a guess, itself first: shifted up to ``reach_m``, then turned up to ``reach_rad``.
 
     ``arm_m`` is the distance at which a turn displaces points, ``basin_m`` the displacement that registration
     mends by itself, hence the spacing.

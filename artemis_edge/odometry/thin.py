@@ -10,7 +10,7 @@ from artemis_edge._jit import njit
 from artemis_edge.config import OdometryConfig
 from artemis_edge.frames import F32, F64, I64, LidarScan, SyncedFrame
 from artemis_edge.odometry.deskew import move_points
-from artemis_edge.odometry.plane_map import EMPTY, probe
+from artemis_edge.odometry.plane_map import EMPTY, empty_hash, probe
 
 _BITS = 21  # +-2^20 cells an axis
 _TRIES = 4  # sizes tried for a frame; the next frame goes on from the last
@@ -33,7 +33,7 @@ class TimedPoints(NamedTuple):
 
 
 class Thinner:
-    """Picks the points of a frame: every ``insert_m`` for the map, about ``points`` of those for registration.
+    """Picks points of a frame: every ``insert_m`` for the map, about ``points`` of them to register.
 
     The spacing of the latter follows the scene, so that a room and a street cost the same.
     """
@@ -46,7 +46,9 @@ class Thinner:
         """Points for the map and points to register; points out of range or not finite are left out."""
         c = self._config
         parts = [self._dense(scan, frame.stamp_ns) for scan in frame.scans]
-        dense = TimedPoints(np.concatenate([p.points for p in parts]), np.concatenate([p.time_s for p in parts]))
+        dense = TimedPoints(
+            np.concatenate([p.points for p in parts]), np.concatenate([p.time_s for p in parts])
+        )
         for _ in range(_TRIES):
             rows = first_per_voxel(dense.points, self._spacing_m, 0.0, np.inf)
             ratio = len(rows) / c.points
@@ -60,7 +62,9 @@ class Thinner:
         """Points for the map of one scan, in the lidar frame, their times relative to the frame's stamp."""
         c, T = self._config, scan.T_lidar_sensor
         rows = first_per_voxel(np.ascontiguousarray(scan.points), c.insert_m, c.min_range_m, c.max_range_m)
-        points = (scan.points[rows] @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+        points = scan.points[rows]
+        if not np.array_equal(T, np.eye(4)):
+            points = (points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
         time_s = np.zeros(len(rows), np.float32) if scan.offset_s is None else scan.offset_s[rows]
         return TimedPoints(points, time_s + np.float32((scan.stamp_ns - stamp_ns) * 1e-9))
 
@@ -71,10 +75,7 @@ def first_per_voxel(points: F32, voxel_m: float, min_range_m: float, max_range_m
 
     Points that are not finite or whose distance from the origin lies outside the ranges are left out.
     """
-    size = 1
-    while size < 2 * len(points):
-        size *= 2
-    table = np.full((size, 2), EMPTY)
+    table = empty_hash(len(points))
     rows = np.empty(len(points), np.int64)
     n, inverse, half = 0, 1.0 / voxel_m, 1 << (_BITS - 1)
     low, high = min_range_m**2, max_range_m**2
