@@ -70,9 +70,36 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
 class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """Voxel grid that scans are allocated to (section III-B, voxel_map.py)."""
 
+    voxel_m: Annotated[
+        float,
+        _float("Edge of a voxel [m]; the point spacing r is a quarter of it.", ge=0.08, le=4.0),
+    ] = 0.4
+    min_range_m: Annotated[
+        float, _float("Points nearer than this are the operator or the housing [m].", ge=0.0, le=10.0)
+    ] = 0.8
+    max_range_m: Annotated[
+        float, _float("Points farther than this are not mapped [m].", gt=0.0, le=1000.0)
+    ] = 100.0
+    noise_range_m: Annotated[
+        float,
+        _float("Range where the error from beam angle equals the ranging error: 2 cm / 1 mrad [m].", gt=0.0),
+    ] = 20.0
+    plane_sigma_m: Annotated[
+        float,
+        _float("Thickness up to which points are one plane: ranging noise 1 sigma [m].", gt=0.0, le=0.5),
+    ] = 0.02
+    memory_budget_mb: Annotated[
+        int,
+        Meta(description="Resident memory of the whole process; beyond it blocks go to disk [MB].", ge=600),
+    ] = 2000
+
 
 class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """Incremental meshing of active voxels (section III-B, mesher.py)."""
+
+    min_distance: Annotated[
+        float, _float("Vertices nearer than this share of the point spacing are merged.", ge=0.0, le=1.0)
+    ] = 0.6
 
 
 class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
