@@ -11,4 +11,3 @@ from functools import partial
 import numba
 
 njit = partial(numba.njit, cache=True, nogil=True, error_model="numpy")
-inline = partial(numba.njit, cache=True, nogil=True, error_model="numpy", inline="always")

@@ -1,0 +1,75 @@
+"""Cell codes: the 12 x 12 x 12 cells of a voxel and its 26 neighbours as one small integer.
+
+A code packs three coordinates of 5 bits, biased by 8, so that a code can be moved to a neighbour's frame by one
+addition without a borrow (the moved coordinates lie in 4..23). Own cells have coordinates 12..15.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from artemis_edge._jit import njit
+from artemis_edge.block_store import Store
+from artemis_edge.frames import I32
+
+CODES = 1 << 15
+OWN = 12  # first own coordinate
+
+
+@njit
+def code_of(X: int, Y: int, Z: int) -> int:
+    """Code of biased coordinates."""
+    return (X << 10) | (Y << 5) | Z
+
+
+@njit
+def neighbour_shift(k: int) -> int:
+    """What to add to a code of neighbour ``k`` (0..26 as in ``neighbours27``) to express it in the own frame."""
+    return ((k // 9 - 1) * 4 << 10) + (((k // 3) % 3 - 1) * 4 << 5) + (k % 3 - 1) * 4
+
+
+@njit
+def code_voxel(code: int) -> int:
+    """Which of the 27 voxels a code lies in."""
+    return (((code >> 10) - 8) >> 2) * 9 + ((((code >> 5) & 31) - 8) >> 2) * 3 + (((code & 31) - 8) >> 2)
+
+
+@njit
+def code_cell(code: int) -> int:
+    """Cell 0..63 within its voxel."""
+    return (((code >> 10) & 3) << 4) | (((code >> 5) & 3) << 2) | (code & 3)
+
+
+@njit
+def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32) -> int:
+    """Cells with evidence of a voxel (first) and within ``margin`` cells around it.
+
+    Writes ``grid[code] = slot`` and lists the codes; returns how many.
+    """
+    n = gather_voxel(store, neighbour[13], 13, margin, grid, code, 0)
+    for k in range(27):
+        if k != 13 and neighbour[k] >= 0:
+            n = gather_voxel(store, neighbour[k], k, margin, grid, code, n)
+    return n
+
+
+@njit
+def gather_voxel(store: Store, w: int, k: int, margin: int, grid: I32, code: I32, n: int) -> int:
+    """The part of ``gather_cells`` for one of the 27 voxels."""
+    lo, hi = OWN - margin, OWN + 4 + margin
+    bx, by, bz = 8 + (k // 9) * 4, 8 + ((k // 3) % 3) * 4, 8 + (k % 3) * 4
+    mask = store.voxel_mask[w]
+    c = 0
+    while mask != 0:
+        while (mask & np.uint64(1)) == 0:
+            mask >>= np.uint64(1)
+            c += 1
+        X, Y, Z = bx + (c >> 4), by + ((c >> 2) & 3), bz + (c & 3)
+        if lo <= X and X < hi and lo <= Y and Y < hi and lo <= Z and Z < hi:
+            at = code_of(X, Y, Z)
+            grid[at] = store.voxel_cell[w, c]
+            code[n] = at
+            n += 1
+        mask >>= np.uint64(1)
+        c += 1
+    return n

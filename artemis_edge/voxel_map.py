@@ -1,0 +1,272 @@
+"""Section III-B, voxel fusion: scans are allocated to a 3-D grid that keeps evidence instead of points.
+
+A cell of edge ``r`` accumulates the moments of the points that fall into it. Its vertex is their mean, moved
+onto the plane that the surrounding cells agree on: the minimum of the point-to-plane energy (E_geometry of
+eq. 2) for that vertex, so that every further scan averages the sensor noise down.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from artemis_edge import block_store as bs
+from artemis_edge._jit import njit
+from artemis_edge.block_store import (
+    ALIVE,
+    BLOCK,
+    CARVED,
+    CONFIRMED,
+    COUNT,
+    EVIDENCE_ONLY,
+    NORMAL,
+    PENDING,
+    POSITION,
+    ROUGHNESS,
+    SEEN,
+    SINCE,
+    SQUARE,
+    SUM,
+    THROUGH,
+    TOUCHED,
+    VIEW,
+    Store,
+)
+from artemis_edge.cell_code import CODES, code_of, gather_cells
+from artemis_edge.config import VoxelMapConfig
+from artemis_edge.eigen3 import smallest_eigen3
+from artemis_edge.frames import F32, F64, I32, TrackedFrame
+
+POOL_FULL = -1
+# A cell with this much evidence no longer asks for re-meshing: its mean moves by less than sigma / 8
+SETTLED_COUNT = 64.0
+# Moments stop growing here, far below where float32 sums lose digits
+SATURATED_COUNT = 1000.0
+
+
+class VoxelMap:
+    """The paper's 3-D grid of voxels; see ``block_store`` for its memory.
+
+    ``insert`` allocates a frame's points; ``store`` is read and written by the mesher.
+    """
+
+    def __init__(self, config: VoxelMapConfig, budget_bytes: float) -> None:
+        self.config = config
+        self.store = bs.allocate(budget_bytes)
+        self._touched = np.empty(self.store.voxel.shape[0], np.int32)
+
+    def insert(self, frame: TrackedFrame) -> I32:
+        """Allocate the points of a frame; returns the slots of the voxels that received points."""
+        n = 0
+        for scan in frame.scans:
+            n = insert_points(
+                self.store,
+                scan.points,
+                frame.T_world_lidar,
+                scan.origin,
+                self.config.voxel_m / bs.CELLS_PER_VOXEL,
+                self.config.min_range_m,
+                self.config.max_range_m,
+                self.config.noise_range_m,
+                frame.index + 1,
+                self._touched,
+                n,
+            )
+        return self._touched[:n].copy()
+
+
+@njit
+def insert_points(
+    store: Store,
+    points: F32,
+    T_world_lidar: F64,
+    origin: F64,
+    cell_m: float,
+    min_range_m: float,
+    max_range_m: float,
+    noise_range_m: float,
+    stamp: int,
+    touched: I32,
+    n: int,
+) -> int:
+    """Add points (n, 3) in the lidar frame to their cells; ``touched`` gets voxels first seen at ``stamp``.
+
+    A point weighs 1 / (1 + (range / noise_range)^2): the inverse variance of a LiDAR whose error is a constant
+    in range plus a constant in angle, relative to its variance at close range. Returns the length of
+    ``touched``; points that find the pool full are left out (the caller makes room and is told by the counters).
+    """
+    R, t = T_world_lidar[:3, :3], T_world_lidar[:3, 3]
+    evidence, voxel, voxel_cell = store.evidence, store.voxel, store.voxel_cell
+    inverse = 1.0 / cell_m
+    last_x, last_y, last_z, v = -(2**40), 0, 0, -1
+    for i in range(points.shape[0]):
+        ax, ay, az = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        ex, ey, ez = origin[0] - ax, origin[1] - ay, origin[2] - az
+        range_m = math.sqrt(ex * ex + ey * ey + ez * ez)
+        if not (range_m >= min_range_m and range_m <= max_range_m):  # NaN fails both
+            continue
+        px = R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az + t[0]
+        py = R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az + t[1]
+        pz = R[2, 0] * ax + R[2, 1] * ay + R[2, 2] * az + t[2]
+        cx, cy, cz = math.floor(px * inverse), math.floor(py * inverse), math.floor(pz * inverse)
+        x, y, z = cx >> 2, cy >> 2, cz >> 2
+        if x != last_x or y != last_y or z != last_z:
+            v = _voxel_at(store, x, y, z, stamp)
+            last_x, last_y, last_z = x, y, z
+            if v >= 0 and voxel[v, TOUCHED] != stamp:
+                voxel[v, TOUCHED] = stamp
+                touched[n] = v
+                n += 1
+        if v < 0:
+            continue
+        c = ((cx & 3) << 4) | ((cy & 3) << 2) | (cz & 3)
+        s = voxel_cell[v, c]
+        if s < 0:
+            s = bs.add_cell(store, v, c)
+            if s < 0:
+                continue
+            voxel[v, PENDING] += 4
+        e = evidence[s]
+        if e[COUNT] >= SATURATED_COUNT:
+            continue
+        if e[COUNT] < SETTLED_COUNT:
+            voxel[v, PENDING] += 1
+        w = 1.0 / (1.0 + (range_m / noise_range_m) ** 2)
+        dx, dy, dz = px - (cx + 0.5) * cell_m, py - (cy + 0.5) * cell_m, pz - (cz + 0.5) * cell_m
+        e[COUNT] += w
+        e[SUM] += w * dx
+        e[SUM + 1] += w * dy
+        e[SUM + 2] += w * dz
+        e[SQUARE] += w * dx * dx
+        e[SQUARE + 1] += w * dx * dy
+        e[SQUARE + 2] += w * dx * dz
+        e[SQUARE + 3] += w * dy * dy
+        e[SQUARE + 4] += w * dy * dz
+        e[SQUARE + 5] += w * dz * dz
+        s_w = w / max(range_m, 1e-6)
+        e[VIEW] += s_w * (R[0, 0] * ex + R[0, 1] * ey + R[0, 2] * ez)
+        e[VIEW + 1] += s_w * (R[1, 0] * ex + R[1, 1] * ey + R[1, 2] * ez)
+        e[VIEW + 2] += s_w * (R[2, 0] * ex + R[2, 1] * ey + R[2, 2] * ez)
+    return n
+
+
+@njit
+def _voxel_at(store: Store, x: int, y: int, z: int, stamp: int) -> int:
+    block = bs.find_or_add_block(store, x >> 3, y >> 3, z >> 3)
+    if block < 0:
+        return POOL_FULL
+    store.block[block, SEEN] = stamp
+    inner = bs.inner_index(x, y, z)
+    v = store.block_voxel[block, inner]
+    return v if v >= 0 else bs.add_voxel(store, block, inner, x, y, z)
+
+
+@njit
+def refresh_voxel(
+    store: Store,
+    v: int,
+    cell_m: float,
+    plane_sigma_m: float,
+    min_distance: float,
+    neighbour: I32,
+    grid: I32,
+    code: I32,
+    eigen: F64,
+) -> None:
+    """Recompute the vertices of one voxel from the moments of the 3 x 3 x 3 cells around each.
+
+    The vertex goes onto the common plane; where the cells do not agree on a plane (smallest eigenvalue above
+    ``plane_sigma_m`` squared: a crease, a bush) only by the share sigma^2 / lambda_0, because there a plane
+    would cut the corner (measured: ungated vertices are worse than raw ones at creases). A cell becomes a vertex
+    when no living vertex is nearer than ``min_distance``; ``grid`` (CODES,) must come and leaves as -1.
+    """
+    evidence, vertex, state = store.evidence, store.vertex, store.state
+    bs.neighbours27(store, v, neighbour)
+    n = gather_cells(store, neighbour, 1, grid, code)
+    x0, y0, z0 = store.voxel[v, 0] * 4, store.voxel[v, 1] * 4, store.voxel[v, 2] * 4
+    for i in range(n):
+        X, Y, Z = (code[i] >> 10) - 12, ((code[i] >> 5) & 31) - 12, (code[i] & 31) - 12
+        if ((X | Y | Z) & ~3) != 0:
+            continue
+        s = grid[code[i]]
+        e = evidence[s]
+        inverse = 1.0 / e[COUNT]
+        mx, my, mz = e[SUM] * inverse, e[SUM + 1] * inverse, e[SUM + 2] * inverse
+        N, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
+        xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        vx, vy, vz = 0.0, 0.0, 0.0
+        near = False
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                for dz in range(-1, 2):
+                    t = grid[code[i] + (dx << 10) + (dy << 5) + dz]
+                    if t < 0:
+                        continue
+                    f = evidence[t]
+                    k = f[COUNT]
+                    ox, oy, oz = dx * cell_m, dy * cell_m, dz * cell_m
+                    ux, uy, uz = f[SUM], f[SUM + 1], f[SUM + 2]
+                    N += k
+                    sx += ux + k * ox
+                    sy += uy + k * oy
+                    sz += uz + k * oz
+                    xx += f[SQUARE] + 2.0 * ux * ox + k * ox * ox
+                    xy += f[SQUARE + 1] + ux * oy + uy * ox + k * ox * oy
+                    xz += f[SQUARE + 2] + ux * oz + uz * ox + k * ox * oz
+                    yy += f[SQUARE + 3] + 2.0 * uy * oy + k * oy * oy
+                    yz += f[SQUARE + 4] + uy * oz + uz * oy + k * oy * oz
+                    zz += f[SQUARE + 5] + 2.0 * uz * oz + k * oz * oz
+                    vx += f[VIEW]
+                    vy += f[VIEW + 1]
+                    vz += f[VIEW + 2]
+        inverse = 1.0 / N
+        gx, gy, gz = sx * inverse, sy * inverse, sz * inverse
+        smallest_eigen3(
+            xx * inverse - gx * gx,
+            xy * inverse - gx * gy,
+            xz * inverse - gx * gz,
+            yy * inverse - gy * gy,
+            yz * inverse - gy * gz,
+            zz * inverse - gz * gz,
+            eigen,
+        )
+        nx, ny, nz = eigen[0], eigen[1], eigen[2]
+        l0, l1 = max(eigen[3], 0.0), max(eigen[4], 0.0)
+        if nx * vx + ny * vy + nz * vz < 0.0:
+            nx, ny, nz = -nx, -ny, -nz
+        if l1 > 4.0 * l0 and l1 > 1e-8:
+            # a plane: the points spread at least twice as far along it as across it
+            sigma2 = plane_sigma_m * plane_sigma_m
+            share = 1.0 if l0 <= sigma2 else sigma2 / l0
+            d = share * ((mx - gx) * nx + (my - gy) * ny + (mz - gz) * nz)
+            mx, my, mz = mx - d * nx, my - d * ny, mz - d * nz
+        else:
+            # no plane: the best known direction is where it was seen from
+            r = math.sqrt(vx * vx + vy * vy + vz * vz) + 1e-12
+            nx, ny, nz = vx / r, vy / r, vz / r
+        p = vertex[s]
+        p[POSITION] = (x0 + X + 0.5) * cell_m + mx
+        p[POSITION + 1] = (y0 + Y + 0.5) * cell_m + my
+        p[POSITION + 2] = (z0 + Z + 0.5) * cell_m + mz
+        p[NORMAL], p[NORMAL + 1], p[NORMAL + 2] = nx, ny, nz
+        p[ROUGHNESS] = math.sqrt(l0)
+        if state[s] == EVIDENCE_ONLY and _is_apart(vertex, state, grid, code[i], s, min_distance):
+            state[s] = ALIVE
+    for i in range(n):
+        grid[code[i]] = -1
+
+
+@njit
+def _is_apart(vertex: F32, state: np.ndarray, grid: I32, at: int, s: int, min_distance: float) -> bool:
+    p = vertex[s]
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                t = grid[at + (dx << 10) + (dy << 5) + dz]
+                if t >= 0 and t != s and state[t] == ALIVE:
+                    q = vertex[t]
+                    gap = (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
+                    if gap < min_distance * min_distance:
+                        return False
+    return True
