@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from artemis_edge._jit import inline, njit
+from artemis_edge._jit import njit
 from artemis_edge.frames import F32, F64, I32
 
 NOTHING = -1  # of the triangle buffer
@@ -33,7 +33,7 @@ class Projection(NamedTuple):
     cull: bool
 
 
-@inline
+@njit
 def _to_image(p: Projection, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Pixel u, v and nearness of a point in view coordinates that is not nearer than the near plane."""
     if p.orthographic:
@@ -139,7 +139,7 @@ def draw(
             _fill_clipped(points, faces[k], p, first + k, nearness, triangle)
 
 
-@inline
+@njit
 def _weights(a: F32, b: F32, c: F32, x: float, y: float, orthographic: bool) -> tuple[float, float, float]:
     """Barycentric weights, not normalised, where the sight line (x, y) meets the plane of triangle a, b, c.
 
@@ -155,7 +155,7 @@ def _weights(a: F32, b: F32, c: F32, x: float, y: float, orthographic: bool) -> 
     return _volume(b, c, x, y), _volume(c, a, x, y), _volume(a, b, x, y)
 
 
-@inline
+@njit
 def _volume(b: F32, c: F32, x: float, y: float) -> float:
     """Triple product of (x, y, 1), b and c."""
     b0, b1, b2 = float(b[0]), float(b[1]), float(b[2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,19 +54,36 @@ def thin(chunks: Iterator[F32], voxel: float) -> F64:
 
     The grid is anchored at the origin. Raises InputError for coordinates too far apart to be one scene.
     """
-    keys: list[I64] = []
-    sums: list[F64] = []  # x, y, z, number of points
+    merged = _Sums(np.empty(0, np.int64), np.empty((0, 4)))
+    pending = [merged]
     for chunk in chunks:
-        key, inverse, count = np.unique(_cells(chunk, voxel), return_inverse=True, return_counts=True)
-        keys.append(key)
-        sums.append(np.stack([*(np.bincount(inverse, chunk[:, k], len(key)) for k in range(3)), count], 1))
-    if not keys:
-        return np.empty((0, 3))
-    key, inverse = np.unique(np.concatenate(keys), return_inverse=True)
-    table = np.concatenate(sums)
-    total = np.stack([np.bincount(inverse, table[:, k], len(key)) for k in range(4)], 1)
+        ones = np.ones((len(chunk), 1), np.float32)
+        pending.append(_sum_by_cell(_cells(chunk, voxel), np.concatenate([chunk, ones], axis=1)))
+        # Merging whenever as much waits as is merged keeps both time and memory in proportion to the result.
+        if sum(len(p.cell) for p in pending[1:]) > max(len(merged.cell), _SAMPLES_AT_ONCE):
+            merged = _merge(pending)
+            pending = [merged]
+    total = _merge(pending).sums
     mean: F64 = total[:, :3] / total[:, 3:]
     return mean
+
+
+class _Sums(NamedTuple):
+    """Sums of x, y, z and the number of points, float64 (n, 4), of voxels ``cell`` int64 (n,), ascending."""
+
+    cell: I64
+    sums: F64
+
+
+def _sum_by_cell(cell: I64, rows: F32 | F64) -> _Sums:
+    unique, inverse = np.unique(cell, return_inverse=True)
+    return _Sums(unique, np.stack([np.bincount(inverse, rows[:, k], len(unique)) for k in range(4)], axis=1))
+
+
+def _merge(parts: list[_Sums]) -> _Sums:
+    if len(parts) == 1:
+        return parts[0]
+    return _sum_by_cell(np.concatenate([p.cell for p in parts]), np.concatenate([p.sums for p in parts]))
 
 
 def _cells(points: F32, voxel: float) -> I64:

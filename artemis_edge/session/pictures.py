@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import cv2
 import numpy as np
 
-from artemis_edge.evaluate.mesh import Comparison
+from artemis_edge.evaluate.mesh import Comparison, MeshEvaluation
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F32, F64, U8, CameraModel, Trajectory
 from artemis_edge.raster import Projection
-from artemis_edge.render import Rendering, View, from_above, perspective, render
+from artemis_edge.render import Rendering, View, from_above, perspective, render, write_png
 from artemis_edge.session import drawing
 
 Kind = Literal["texture", "label", "confidence", "height"]
@@ -120,6 +121,11 @@ def heat_maps(comparison: Comparison) -> U8:
     ]
     wide = panels[0].shape[1] > panels[0].shape[0]
     return np.concatenate(panels, axis=0 if wide else 1)
+
+
+def write_heat_maps(path: Path, evaluation: MeshEvaluation) -> None:
+    """Heat maps of the first threshold as PNG; raises RunError when the file cannot be written."""
+    write_png(path, heat_maps(evaluation.comparisons[0]))
 
 
 def _render(view: View, shown: Scene, kind: Kind) -> Rendering:
