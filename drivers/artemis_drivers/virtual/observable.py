@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_drivers._jit import inline, njit
+from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8, WorldMesh
-from artemis_drivers.virtual.raycast import occluded
+from artemis_drivers.virtual.raycast import first_free_line
 from artemis_drivers.virtual.scene import Scene
 
 I64 = NDArray[np.int64]
@@ -23,6 +23,9 @@ REACH_M = 0.10
 _THIN_M = 0.05  # one beam is remembered per object and cube of this edge: the one that came from nearest
 _TRIES = 3  # beams asked for a free line before a point is given up
 _SLACK_M = 0.005
+_CELL_M = 2 * REACH_M
+_COARSE_M = 0.5
+_PORTION = 2_000_000  # points handled at once: bounds memory
 _EMPTY = np.int64(-1)
 
 
@@ -79,39 +82,72 @@ def observed_surface(mesh: WorldMesh, scene: Scene, store: HitStore, spacing_m: 
     low, high = corners.min(axis=(0, 1)) - REACH_M, corners.max(axis=(0, 1)) + REACH_M
     local = store.hit - scene.origin
     near = np.flatnonzero(((local >= low) & (local <= high)).all(axis=1))
-    hit, origin, instance = local[near], store.origin[near] - scene.origin, store.instance[near]
-    order, table, start = _index(_cells(hit))
-    hit, origin, instance = hit[order], origin[order], instance[order]
-    coarse = _hash_set(np.unique(_pack(_dilated(np.floor(hit / (5 * REACH_M)).astype(np.int64)))))
+    beams = _beams_index(local[near], store.origin[near] - scene.origin, store.instance[near])
     _, normals = mesh.areas_and_normals()
-    count = _sample(corners, normals, mesh.instance, spacing_m, table, start, hit, origin, instance, coarse, np.empty((0, 3)), np.empty(0, np.int32), np.empty((0, _TRIES), np.int32))  # fmt: skip
-    points, triangle = np.empty((count, 3)), np.empty(count, np.int32)
-    beams = np.empty((count, _TRIES), np.int32)
-    _sample(corners, normals, mesh.instance, spacing_m, table, start, hit, origin, instance, coarse, points, triangle, beams)  # fmt: skip
-    seen = _free_line(scene, points, origin, beams)
-    triangle = triangle[seen]
+    pieces = [
+        _observed_part(corners[part], normals[part], mesh.instance[part], spacing_m, beams, scene)
+        for part in _portions(corners, spacing_m)
+    ]
+    points = np.concatenate([p for p, _ in pieces])
+    triangle = np.concatenate(
+        [t + part.start for (_, t), part in zip(pieces, _portions(corners, spacing_m), strict=True)]
+    )
     return ObservedSurface(
-        (points[seen] + scene.origin).astype(np.float32),
+        (points + scene.origin).astype(np.float32),
         normals[triangle].astype(np.float32),
         mesh.class_id[triangle],
         mesh.instance[triangle],
     )
 
 
-def _free_line(scene: Scene, points: F64, origin: F64, beams: I32) -> NDArray[np.bool_]:
-    """Which points are seen from the origin of one of their beams (-1: no further beam)."""
-    seen = np.zeros(len(points), bool)
-    for attempt in range(_TRIES):
-        open_ = np.flatnonzero(~seen & (beams[:, attempt] >= 0))
-        if len(open_) == 0:
-            break
-        start = origin[beams[open_, attempt]] + scene.origin
-        seen[open_] = ~occluded(scene.bvh, start, points[open_] + scene.origin, _SLACK_M)
-    return seen
+@dataclass(frozen=True, slots=True)
+class _Beams:
+    """Beams sorted by cell: ``table`` hash set of the cells, ``start`` (slots, 2) rows of a cell's beams;
+    ``coarse`` hash set of the larger cells that have a beam in or beside them. Positions are local.
+    """
+
+    hit: F64
+    origin: F64
+    instance: I32
+    table: I64
+    start: I64
+    coarse: I64
 
 
-def _cells(points: F64) -> I64:
-    return np.asarray(_pack(np.floor(points / REACH_M).astype(np.int64)), np.int64)
+def _beams_index(hit: F64, origin: F64, instance: I32) -> _Beams:
+    order, table, start = _index(_pack(np.floor(hit / _CELL_M).astype(np.int64)))
+    coarse = _hash_set(np.unique(_pack(_dilated(np.floor(hit / _COARSE_M).astype(np.int64)))))
+    return _Beams(hit[order], origin[order], instance[order], table, start, coarse)
+
+
+def _portions(corners: F64, spacing_m: float) -> list[slice]:
+    """Runs of triangles of about _PORTION points each."""
+    ends = np.cumsum(_points_at_most(corners, spacing_m))
+    cuts = np.searchsorted(ends, np.arange(_PORTION, ends[-1] if len(ends) else 0, _PORTION)) + 1
+    edges = np.unique([0, *cuts.tolist(), len(corners)])
+    return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def _points_at_most(corners: F64, spacing_m: float) -> F64:
+    """Upper bound of the points that :func:`_sample` puts on each triangle."""
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    longest = edges.max(axis=1)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    rows = np.rint(2 * area / np.maximum(longest, 1e-12) / spacing_m) + 1
+    return np.asarray(rows * (longest / spacing_m / 2 + 2) + 2)
+
+
+def _observed_part(
+    corners: F64, normals: F64, instance: I32, spacing_m: float, beams: _Beams, scene: Scene
+) -> tuple[F64, NDArray[np.int64]]:
+    """Observed points of some triangles, in local coordinates, and the triangles they lie on."""
+    room = int(_points_at_most(corners, spacing_m).sum())
+    points, triangle = np.empty((room, 3)), np.empty(room, np.int64)
+    tries = np.empty((room, _TRIES), np.int32)
+    count = _sample(corners, normals, instance, spacing_m, beams.table, beams.start, beams.hit, beams.origin, beams.instance, beams.coarse, points, triangle, tries)  # fmt: skip
+    points, triangle, tries = points[:count], triangle[:count], tries[:count]
+    seen = first_free_line(scene.bvh, points, beams.origin, tries, _SLACK_M) >= 0
+    return points[seen], triangle[seen]
 
 
 def _pack(cell: I64) -> I64:
@@ -144,7 +180,7 @@ def _hash_set(keys: I64) -> I64:
     return table
 
 
-@inline
+@njit
 def _slot(table: I64, key: int) -> int:
     """Slot of a key, or of the empty place where it would stand (open addressing)."""
     mask = len(table) - 1
@@ -168,7 +204,7 @@ def _fill_start(table: I64, distinct: I64, bounds: I64, start: I64) -> None:
         start[slot, 0], start[slot, 1] = bounds[k], bounds[k + 1]
 
 
-@inline
+@njit
 def _key(x: float, y: float, z: float, cell: float) -> int:
     half = 1 << 20
     i, j, k = int(np.floor(x / cell)), int(np.floor(y / cell)), int(np.floor(z / cell))
@@ -179,12 +215,12 @@ def _key(x: float, y: float, z: float, cell: float) -> int:
 def _beams_near(p: F64, normal: F64, instance: int, table: I64, start: I64, hit: F64, origin: F64, owner: I32, beams: I32) -> int:  # fmt: skip
     """Up to len(beams) beams that met the object within reach of ``p`` and came from the front of it."""
     found = 0
-    cell = REACH_M
-    for n in range(27):
-        # the own cell first: mostly it suffices
-        m = (n + 13) % 27
-        dx, dy, dz = m // 9 - 1, (m // 3) % 3 - 1, m % 3 - 1
-        key = _key(p[0] + dx * cell, p[1] + dy * cell, p[2] + dz * cell, cell)
+    # cells are twice the reach wide: a sphere of that radius touches two of them along each axis at most
+    sx = _CELL_M / 2 if p[0] / _CELL_M - np.floor(p[0] / _CELL_M) >= 0.5 else -_CELL_M / 2
+    sy = _CELL_M / 2 if p[1] / _CELL_M - np.floor(p[1] / _CELL_M) >= 0.5 else -_CELL_M / 2
+    sz = _CELL_M / 2 if p[2] / _CELL_M - np.floor(p[2] / _CELL_M) >= 0.5 else -_CELL_M / 2
+    for n in range(8):
+        key = _key(p[0] + (n & 1) * sx, p[1] + (n >> 1 & 1) * sy, p[2] + (n >> 2) * sz, _CELL_M)
         slot = _slot(table, key)
         if table[slot] != key:
             continue
@@ -206,11 +242,10 @@ def _beams_near(p: F64, normal: F64, instance: int, table: I64, start: I64, hit:
 @njit
 def _sample(
     corners: F64, normals: F64, triangle_instance: I32, spacing: float, table: I64, start: I64, hit: F64, origin: F64, owner: I32, coarse: I64,
-    points: F64, triangle: I32, beams: I32,
+    points: F64, triangle: I64, tries: I32,
 ) -> int:  # fmt: skip
-    """Rows of points on every triangle; keeps (or, with empty outputs, counts) those with beams near."""
+    """Rows of points on every triangle; keeps those with beams near, returns their number."""
     count = 0
-    near = np.empty(_TRIES, np.int32)
     p = np.empty(3)
     for t in range(len(corners)):
         a, b, c = _longest_edge_first(corners[t])
@@ -218,30 +253,28 @@ def _sample(
         along = (b - a) / max(base, 1e-12)
         foot = ((c - a) * along).sum()
         rise = (c - a) - foot * along
-        height = np.sqrt((rise**2).sum())
-        rows = max(int(np.rint(height / spacing)), 1)
+        rows = max(int(np.rint(np.sqrt((rise**2).sum()) / spacing)), 1)
         for r in range(rows):
             share = (r + 0.5) / rows
             left, right = share * foot, base - share * (base - foot)
             columns = max(int(np.rint((right - left) / spacing)), 1)
             step = (right - left) / columns
-            skip_until = -1
-            for k in range(columns):
-                if k < skip_until:
-                    continue
+            k = 0
+            while k < columns:
                 at = left + (k + 0.5) * step
                 for axis in range(3):
                     p[axis] = a[axis] + at * along[axis] + share * rise[axis]
-                coarse_key = _key(p[0], p[1], p[2], 5 * REACH_M)
-                if coarse[_slot(coarse, coarse_key)] != coarse_key:
-                    # nothing within a whole coarse cell: the next points cannot be near anything either
-                    skip_until = k + max(int(4 * REACH_M / step), 1)
+                key = _key(p[0], p[1], p[2], _COARSE_M)
+                if coarse[_slot(coarse, key)] != key:
+                    # no beam within a whole coarse cell, so none near the next points either
+                    k += max(int((_COARSE_M - REACH_M) / step), 1)
                     continue
+                near = tries[count]
                 near[:] = -1
                 if _beams_near(p, normals[t], triangle_instance[t], table, start, hit, origin, owner, near):
-                    if len(points):
-                        points[count], triangle[count], beams[count] = p, t, near
+                    points[count], triangle[count] = p, t
                     count += 1
+                k += 1
     return count
 
 

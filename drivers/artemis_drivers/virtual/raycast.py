@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32
 
+Vector = tuple[float, float, float]
 _LEAF = 4  # triangles in a leaf at most
 _BINS = 16
 _STACK = 96
 _EPS = np.float32(2e-6)  # barycentric slack: no ray slips between two triangles that share an edge
+_SLACK = np.float32(1.0000004)
 _F0, _F1, _FINF = np.float32(0), np.float32(1), np.float32(np.inf)
 
 
@@ -81,13 +83,15 @@ def cast(bvh: Bvh, origins: F64, directions: F64, max_m: F64 | float = np.inf) -
     return Hits(distance, triangle, u, v)
 
 
-def occluded(bvh: Bvh, origins: F64, targets: F64, slack_m: float) -> NDArray[np.bool_]:
-    """True where something lies between origin and target, more than ``slack_m`` before the target."""
-    delta = targets - origins
-    length = np.linalg.norm(delta, axis=1)
-    hits = cast(bvh, origins, delta / np.maximum(length, 1e-9)[:, None], length)
-    blocked: NDArray[np.bool_] = hits.distance_m < length - slack_m
-    return blocked
+def first_free_line(bvh: Bvh, points: F64, eyes: F64, tries: I32, slack_m: float) -> I32:
+    """Per point the first of its eyes from which nothing blocks the view, -1 when all are blocked.
+
+    ``points`` (n, 3) and ``eyes`` (e, 3) are relative to ``bvh.origin``; ``tries`` int32 (n, k) numbers of eyes,
+    -1 for none. What lies within ``slack_m`` before the point does not block.
+    """
+    out = np.empty(len(points), np.int32)
+    _first_free_line(bvh.boxes, bvh.child, bvh.corner, points, eyes, tries, slack_m, out)
+    return out
 
 
 @njit
@@ -214,16 +218,21 @@ def _build(low: F32, high: F32, order: I32) -> tuple[F32, I32, int]:
 
 
 @njit
-def _enter(boxes: F32, node: int, first: int, o: F32, inv: F32, limit: float) -> float:
+def _enter(b: F32, first: int, o: Vector, inv: Vector, limit: float) -> float:
     """Distance at which the ray enters a child's box, inf when it misses."""
-    near, far = _F0, limit
-    for a in range(3):
-        t0 = (boxes[node, first + a] - o[a]) * inv[a]
-        t1 = (boxes[node, first + 3 + a] - o[a]) * inv[a]
-        near = max(near, min(t0, t1))
-        far = min(far, max(t0, t1))
+    x0, x1 = (b[first] - o[0]) * inv[0], (b[first + 3] - o[0]) * inv[0]
+    y0, y1 = (b[first + 1] - o[1]) * inv[1], (b[first + 4] - o[1]) * inv[1]
+    z0, z1 = (b[first + 2] - o[2]) * inv[2], (b[first + 5] - o[2]) * inv[2]
+    near = max(max(min(x0, x1), min(y0, y1)), max(min(z0, z1), _F0))
+    far = min(min(max(x0, x1), max(y0, y1)), min(max(z0, z1), limit))
     # two roundings of slack (Ize, "Robust BVH ray traversal", 2013)
-    return near if near <= far * np.float32(1.0000004) else _FINF
+    return near if near <= far * _SLACK else _FINF
+
+
+@njit
+def _inverse(d: float) -> float:
+    """1 / d, bounded: with an infinity the box test would compute 0 * inf."""
+    return _F1 / d if abs(d) > np.float32(1e-12) else np.float32(1e12)
 
 
 @njit
@@ -232,12 +241,10 @@ def _cast(
 ) -> None:  # fmt: skip
     stack = np.empty(_STACK, np.int32)
     entry = np.empty(_STACK, np.float32)
-    inv = np.empty(3, np.float32)
     for r in range(len(origin)):
-        o, d = origin[r], direction[r]
-        for a in range(3):
-            # no zero and no infinity: 0 * inf in the box test would be NaN
-            inv[a] = _F1 / d[a] if abs(d[a]) > np.float32(1e-12) else np.float32(1e12)
+        o = (origin[r, 0], origin[r, 1], origin[r, 2])
+        d = (direction[r, 0], direction[r, 1], direction[r, 2])
+        inv = (_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
         best, hit, hit_u, hit_v = limit[r], -1, _F0, _F0
         depth = 1
         stack[0], entry[0] = 0, _F0
@@ -250,12 +257,12 @@ def _cast(
                 code = ~node
                 first = code >> 3
                 for k in range(first, first + (code & 7)):
-                    t, u, v = _meet(corner, k, o, d)
+                    t, u, v = _meet(corner[k], o, d)
                     if t < best:
                         best, hit, hit_u, hit_v = t, k, u, v
                 continue
-            t_a = _enter(boxes, node, 0, o, inv, best)
-            t_b = _enter(boxes, node, 6, o, inv, best)
+            box = boxes[node]
+            t_a, t_b = _enter(box, 0, o, inv, best), _enter(box, 6, o, inv, best)
             near_side = 0 if t_a <= t_b else 1
             t_near, t_far = (t_a, t_b) if near_side == 0 else (t_b, t_a)
             if t_far < _FINF:
@@ -270,9 +277,59 @@ def _cast(
 
 
 @njit
-def _meet(corner: F32, k: int, o: F32, d: F32) -> tuple[float, float, float]:
-    """Distance and barycentric u, v where the ray meets a triangle; inf when it does not."""
-    c = corner[k]
+def _first_free_line(
+    boxes: F32, child: I32, corner: F32, points: F64, eyes: F64, tries: I32, slack: float, out: I32
+) -> None:
+    stack = np.empty(_STACK, np.int32)
+    for i in range(len(points)):
+        out[i] = -1
+        for k in range(tries.shape[1]):
+            eye = tries[i, k]
+            if eye < 0:
+                break
+            dx, dy, dz = points[i, 0] - eyes[eye, 0], points[i, 1] - eyes[eye, 1], points[i, 2] - eyes[eye, 2]
+            length = np.sqrt(dx * dx + dy * dy + dz * dz)
+            o = (np.float32(eyes[eye, 0]), np.float32(eyes[eye, 1]), np.float32(eyes[eye, 2]))
+            d = (np.float32(dx / length), np.float32(dy / length), np.float32(dz / length))
+            inv = (_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
+            if not _blocked(boxes, child, corner, o, d, inv, np.float32(length - slack), stack):
+                out[i] = k
+                break
+
+
+@njit
+def _blocked(
+    boxes: F32, child: I32, corner: F32, o: Vector, d: Vector, inv: Vector, limit: float, stack: I32
+) -> bool:
+    """Whether any triangle lies nearer than ``limit`` along the ray."""
+    depth = 1
+    stack[0] = 0
+    while depth > 0:
+        depth -= 1
+        node = stack[depth]
+        if node < 0:
+            code = ~node
+            first = code >> 3
+            for k in range(first, first + (code & 7)):
+                if _meet(corner[k], o, d)[0] < limit:
+                    return True
+            continue
+        box = boxes[node]
+        t_a, t_b = _enter(box, 0, o, inv, limit), _enter(box, 6, o, inv, limit)
+        # what is near the eye blocks more: it is looked at first
+        near_side = 0 if t_a <= t_b else 1
+        if max(t_a, t_b) < _FINF:
+            stack[depth] = child[node, 1 - near_side]
+            depth += 1
+        if min(t_a, t_b) < _FINF:
+            stack[depth] = child[node, near_side]
+            depth += 1
+    return False
+
+
+@njit
+def _meet(c: F32, o: Vector, d: Vector) -> tuple[float, float, float]:
+    """Distance and barycentric u, v where the ray meets the triangle ``c`` of Bvh.corner; inf when it does not."""
     px = d[1] * c[8] - d[2] * c[7]
     py = d[2] * c[6] - d[0] * c[8]
     pz = d[0] * c[7] - d[1] * c[6]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_drivers._jit import inline, njit
+from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
 from artemis_drivers.virtual.scene import Scene
 from artemis_drivers.virtual.textures import LEVELS, MACRO, MACRO_M, SIZE
@@ -63,7 +63,7 @@ def shadow_map(scene: Scene, sun: F64, rasterise: Rasteriser) -> ShadowMap:
     return ShadowMap(depth, rows.astype(np.float32), sun.astype(np.float32))
 
 
-@inline
+@njit
 def _bilinear(texels: I32, first: int, size: int, u: float, v: float) -> tuple[float, float, float]:
     """Colour 0..255 at picture coordinates u, v (1 = one repetition, v upwards)."""
     x, y = u * size - 0.5, (1.0 - v) * size - 0.5
@@ -81,7 +81,7 @@ def _bilinear(texels: I32, first: int, size: int, u: float, v: float) -> tuple[f
     )
 
 
-@inline
+@njit
 def _bilinear_red(texels: I32, first: int, size: int, u: float, v: float) -> float:
     """Red of :func:`_bilinear`, for grey pictures."""
     x, y = u * size - 0.5, (1.0 - v) * size - 0.5
@@ -118,7 +118,7 @@ def sample_slow(texels: I32, start: I64, u: float, v: float, lod: float) -> floa
     return _bilinear_red(texels, start[MACRO, level], SIZE >> level, u / MACRO_M, v / MACRO_M)
 
 
-@inline
+@njit
 def _sunlit(depth: F32, rows: F32, x: float, y: float, z: float) -> float:
     """Share of sun 0..1 at a local point: four neighbours of the shadow map, weighted."""
     u = rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z + rows[0, 3]
@@ -154,7 +154,7 @@ def sky_colour(texels: I32, start: I64, d: Vector) -> Vector:
     return r + cloud * (0.85 - r), g + cloud * (0.85 - g), b + cloud * (0.87 - b)
 
 
-@inline
+@njit
 def _mirrored(texels: I32, start: I64, row: F32, d: Vector, facing: float, gloss: float) -> tuple[float, Vector]:  # fmt: skip
     """Share and light of what a glossy surface mirrors: the sky, or a dark street below the horizon."""
     share = gloss + (1.0 - gloss) * (1.0 + max(facing, -1.0)) ** 5  # Schlick 1994
@@ -164,7 +164,7 @@ def _mirrored(texels: I32, start: I64, row: F32, d: Vector, facing: float, gloss
     return min(share, 0.5), light
 
 
-@inline
+@njit
 def shade(
     row: F32, look: U8, o: F64, d: Vector, pixel: float, texels: I32, start: I64, metres: F32, gloss: F32, shadow: F32, shadow_rows: F32, sun: F32
 ) -> Vector:  # fmt: skip
@@ -198,7 +198,7 @@ def shade(
     return r, g, b
 
 
-@inline
+@njit
 def _direction(R: F64, x: float, y: float) -> Vector:
     """Unit direction in the world of the camera's line (x, y, 1)."""
     inv = 1.0 / np.sqrt(x * x + y * y + 1.0)
