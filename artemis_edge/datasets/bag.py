@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -13,6 +14,7 @@ from artemis_edge.session.cdr import Buffer, CdrError, CdrReader, Ros1Reader
 HEAD_BYTES = 256
 # For ``Bag.scan``: the whole message.
 WHOLE = -1
+_CACHE_BYTES = 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,25 @@ class Bag(Protocol):
     def fetch(self, where: Any) -> Buffer:
         """The whole message that ``scan`` met; CdrError if it cannot be read any more."""
         ...
+
+
+class ChunkCache:
+    """Decompressed chunks by position, the least recently used dropped beyond 64 MB.
+
+    The messages of one frame lie in a few neighbouring chunks.
+    """
+
+    def __init__(self) -> None:
+        self._chunks: OrderedDict[int, bytes] = OrderedDict()
+
+    def get(self, at: int, load: Callable[[int], bytes]) -> bytes:
+        """The chunk at a position, loaded if it is not here."""
+        if at not in self._chunks:
+            self._chunks[at] = load(at)
+            while len(self._chunks) > 1 and sum(map(len, self._chunks.values())) > _CACHE_BYTES:
+                self._chunks.popitem(last=False)
+        self._chunks.move_to_end(at)
+        return self._chunks[at]
 
 
 def ros2_type(name: str) -> str:

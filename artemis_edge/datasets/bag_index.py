@@ -72,7 +72,11 @@ class Track:
 
     def stamp_ns(self) -> I64:
         """Stamps (n,); those of the recorder where the sensor left its own empty."""
-        return np.array(self.stamps if any(self.stamps) else self.logs, np.int64)
+        return _stamps(self.stamps, self.logs)
+
+
+def _stamps(stamps: list[int], logs: list[int]) -> I64:
+    return np.array(stamps if any(stamps) else logs, np.int64)
 
 
 @dataclass(slots=True)
@@ -81,7 +85,12 @@ class ImuTrack:
 
     frame_id: str
     stamps: list[int] = field(default_factory=list)
+    logs: list[int] = field(default_factory=list)
     values: list[F64] = field(default_factory=list)
+
+    def stamp_ns(self) -> I64:
+        """Stamps (n,), those of the recorder where the sensor left its own empty."""
+        return _stamps(self.stamps, self.logs)
 
 
 @dataclass(slots=True)
@@ -152,7 +161,8 @@ class BagIndex:
         if not np.isfinite(value).all():
             raise CdrError("an IMU sample is not finite")
         track = self.imus.setdefault(connection.topic, ImuTrack(message.header.frame_id))
-        track.stamps.append(message.header.stamp_ns or entry.log_ns)
+        track.stamps.append(message.header.stamp_ns)
+        track.logs.append(entry.log_ns)
         track.values.append(value)
 
     def _info(self, connection: Connection, entry: Entry) -> None:

@@ -108,8 +108,9 @@ def find_imu(index: BagIndex, config: InputConfig, lidar_frame: str) -> ImuSampl
     if topic is None:
         return ImuSamples.empty()
     track = index.imus[topic]
-    order = np.argsort(track.stamps, kind="stable")
-    stamps, values = np.array(track.stamps, np.int64)[order], np.array(track.values)[order]
+    stamps = track.stamp_ns()
+    order = np.argsort(stamps, kind="stable")
+    stamps, values = stamps[order], np.array(track.values)[order]
     R = _imu_rotation(index, topic, track.frame_id, lidar_frame)
     gyro, accel = values[:, :3] @ R.T, values[:, 3:] @ R.T
     norm = float(np.median(np.linalg.norm(accel, axis=1)))

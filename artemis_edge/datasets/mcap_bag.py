@@ -7,8 +7,8 @@ interrupted has none, and its complete chunks read the same way. (https://mcap.d
 from __future__ import annotations
 
 import struct
+import weakref
 import zlib
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
@@ -21,7 +21,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from artemis_edge.datasets.bag import WHOLE, Connection, Entry, ros2_type
+from artemis_edge.datasets.bag import WHOLE, ChunkCache, Connection, Entry, ros2_type
 from artemis_edge.datasets.common import add_counts
 from artemis_edge.errors import InputError
 from artemis_edge.session.cdr import Buffer, CdrError
@@ -34,8 +34,6 @@ _CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 # A chunk is a few MB; a length beyond this is a damaged one, not memory to reserve.
 _CHUNK_LIMIT = 1 << 30
-# Decompressed chunks kept: the messages of one frame lie in a few neighbouring chunks.
-_CACHE_BYTES = 64 << 20
 # Smaller than a cloud, larger than an IMU message: those come from the buffer, clouds are passed over.
 _BUFFER_BYTES = 1 << 15
 
@@ -47,8 +45,11 @@ class _Bytes(Protocol):
 
 
 class _File:
+    """Closed when nobody needs it any more: frames are read long after the recording was opened."""
+
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb", _BUFFER_BYTES)
+        weakref.finalize(self, self._file.close)
         self.size = self._file.seek(0, 2)
 
     def read(self, at: int, size: int) -> Buffer:
@@ -74,7 +75,7 @@ class McapBag:
         self.warnings: list[str] = []
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, Connection] = {}
-        self._cache: OrderedDict[int, _Memory] = OrderedDict()
+        self._cache = ChunkCache()
         try:
             self._file = _File(path)
         except OSError as error:
@@ -188,17 +189,14 @@ class McapBag:
 
     def _chunk(self, at: int) -> _Memory:
         """The decompressed chunk whose content begins at ``at``."""
-        if at in self._cache:
-            self._cache.move_to_end(at)
-            return self._cache[at]
+        return _Memory(self._cache.get(at, self._load))
+
+    def _load(self, at: int) -> bytes:
         compression, plain_size, crc, start, length = self._chunk_header(at, self._file.size - at)
         data = _decompress(compression, bytes(self._file.read(start, length)), plain_size)
         if len(data) != plain_size or (crc and zlib.crc32(data) != crc):
             raise CdrError("its checksum is wrong")
-        self._cache[at] = _Memory(data)
-        while len(self._cache) > 1 and sum(chunk.size for chunk in self._cache.values()) > _CACHE_BYTES:
-            self._cache.popitem(last=False)
-        return self._cache[at]
+        return data
 
 
 def _decompress(compression: str, data: bytes, size: int) -> bytes:

@@ -1,16 +1,27 @@
-"""ROS 1 bags (``.bag``), through the package rosbags of the extra ``import``."""
+"""ROS 1 bags (``.bag``), through the package rosbags of the extra ``import``.
+
+rosbags reads the index and finds the chunks; the messages are taken from the chunks here, each of which is
+read once in a pass, whatever the order of the topics in it. (Format: wiki.ros.org/Bags/Format/2.0)
+"""
 
 from __future__ import annotations
 
+import struct
+import weakref
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from artemis_edge.datasets.bag import WHOLE, Connection, Entry
+from artemis_edge.datasets.bag import WHOLE, ChunkCache, Connection, Entry
+from artemis_edge.datasets.common import add_counts
 from artemis_edge.errors import InputError
 from artemis_edge.session.cdr import Buffer, CdrError
 
 MAGIC = b"#ROSBAG V"
+_LENGTH = struct.Struct("<I")
+# A connection may be described within a chunk, before its first message.
+_CONNECTION_RECORD = b"\x04\0\0\0op=\x07"
 
 
 class Ros1Bag:
@@ -24,37 +35,59 @@ class Ros1Bag:
         self.path = path
         self.lost: dict[str, int] = {}
         self.warnings: list[str] = []
-        self._fault = ReaderError
+        self._cache = ChunkCache()
         try:
             self._reader = Reader(path)
             self._reader.open()
-        except (ReaderError, OSError) as error:
+            weakref.finalize(self, self._reader.close)
+        except (ReaderError, OSError, ValueError) as error:
             raise InputError(f"{path} cannot be read ({error}); repair it with 'rosbag reindex'") from None
 
     def scan(self, needed: Callable[[Connection], int]) -> Iterator[Entry]:
-        """Every message once, in the order of recording."""
+        """Every message once, chunk by chunk."""
         chosen = {c.id: Connection(c.topic, c.msgtype, "ros1") for c in self._reader.connections}
         wanted = {number: needed(connection) for number, connection in chosen.items()}
-        connections = [c for c in self._reader.connections if wanted[c.id]]
-        if not connections:
-            return
-        seen: dict[tuple[int, int], int] = {}
-        try:
-            for c, log_ns, data in self._reader.messages(connections):
-                # Several messages of a topic may carry one receive time: the count tells them apart.
-                nth = seen.get((c.id, log_ns), 0)
-                seen[c.id, log_ns] = nth + 1
-                count = wanted[c.id]
-                yield Entry(chosen[c.id], log_ns, data if count == WHOLE else data[:count], (c, log_ns, nth))
-        except (self._fault, OSError, EOFError, RuntimeError, ValueError) as error:
-            self.lost["truncated_file"] = 1
-            self.warnings.append(f"{self.path} is damaged ({error}); what was read up to there is used")
+        chunks: dict[int, list[tuple[int, int, int]]] = defaultdict(list)
+        for number, entries in self._reader.indexes.items():
+            if wanted.get(number):
+                for entry in entries:
+                    chunks[entry.chunk_pos].append((entry.offset, entry.time, number))
+        for chunk in sorted(chunks):
+            for offset, log_ns, number in sorted(chunks[chunk]):
+                try:
+                    data, count = self.fetch((chunk, offset)), wanted[number]
+                except CdrError:
+                    add_counts(self.lost, {"undecodable_messages": 1})
+                    continue
+                yield Entry(chosen[number], log_ns, data if count == WHOLE else data[:count], (chunk, offset))
 
     def fetch(self, where: Any) -> Buffer:
-        """The whole message of a topic at a receive time."""
-        connection, log_ns, nth = where
-        messages = self._reader.messages([connection], start=log_ns, stop=log_ns + 1)
-        for k, (_, _, data) in enumerate(messages):
-            if k == nth:
-                return bytes(data)
-        raise CdrError(f"{self.path} lacks the message of {connection.topic} at {log_ns} ns")
+        """The whole message in a chunk at an offset."""
+        chunk, at = where
+        content = memoryview(self._cache.get(chunk, self._load))
+        try:
+            while True:
+                head, at = _field(content, at)
+                data, at = _field(content, at)
+                if _CONNECTION_RECORD not in bytes(head):
+                    return data
+        except struct.error:
+            raise CdrError(f"{self.path} ends within a message") from None
+
+    def _load(self, chunk: int) -> bytes:
+        place, file = self._reader.chunks[chunk], self._reader.bio
+        try:
+            file.seek(place.datapos)
+            data: bytes = place.decompressor(file.read(place.datasize))
+        except (OSError, EOFError, RuntimeError, ValueError) as error:
+            raise CdrError(f"a chunk of {self.path} is damaged: {error}") from None
+        return data
+
+
+def _field(content: memoryview, at: int) -> tuple[memoryview, int]:
+    """The bytes behind a length, and where they end."""
+    (length,) = _LENGTH.unpack_from(content, at)
+    end = at + _LENGTH.size + length
+    if end > len(content):
+        raise struct.error
+    return content[at + _LENGTH.size : end], end

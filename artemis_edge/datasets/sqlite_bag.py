@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ class SqliteBag:
             self._database = sqlite3.connect(
                 f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False
             )
+            weakref.finalize(self, self._database.close)
             rows = self._database.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             ).fetchall()
