@@ -39,7 +39,7 @@ def _slope(x: float, y: float, distortion: F64) -> tuple[float, float, float]:
 
 @njit
 def _undistort(u: float, v: float, distortion: F64, fold: float) -> tuple[float, float]:
-    """The point (x, y) within the radius ``fold`` that the lens puts at (u, v), by Newton's method; else NaN."""
+    """The point (x, y) within radius ``fold`` that the lens puts at (u, v), by Newton's method; else NaN."""
     x, y = u, v
     for _ in range(_NEWTON_STEPS):
         at_u, at_v = distort(x, y, distortion)

@@ -1,14 +1,18 @@
 """PLY and GLB: what is written is read back, and foreign or broken files are handled."""
 
+import contextlib
 import errno
 import json
 import struct
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.export import ply
@@ -160,6 +164,25 @@ def test_missing_and_wrong_kind(tmp_path: Path) -> None:
     assert ply.read_points(tmp_path / "cloud.ply").points.tolist() == [[1, 2, 3]]
     with pytest.raises(InputError, match="no triangles"):
         ply.read_mesh(tmp_path / "cloud.ply")
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_damaged_files_are_read_or_refused(data: st.DataObject) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "d.ply"
+        write_ply(path, bare_mesh(np.eye(3), np.array([[0, 1, 2]], np.int32)))
+        quads = QUADS.format(format="ascii").encode() + b"0 0 0 " * 5 + b"4 0 1 2 3 3 3 2 4"
+        content = bytearray(data.draw(st.sampled_from([path.read_bytes(), quads])))
+        for _ in range(data.draw(st.integers(1, 3))):
+            start = data.draw(st.integers(0, len(content)))
+            word = data.draw(
+                st.sampled_from([b"-5", b"nan", b"inf", b"1e300", b"99999999999", b"list", b"float"])
+            )
+            content[start : start + data.draw(st.integers(0, 12))] = word
+        path.write_bytes(content)
+        with contextlib.suppress(InputError):
+            assert isinstance(read_ply(path), Mesh | PointCloud)
 
 
 def test_full_disk_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,8 +24,9 @@ from scipy.spatial import cKDTree
 from artemis_edge.errors import InputError, UserError
 from artemis_edge.evaluate.sampling import samples, thin, triangle_areas
 from artemis_edge.evaluate.topology import Topology, topology
+from artemis_edge.export.mesh import finite_rows
 from artemis_edge.export.ply import Mesh, read_mesh, read_points
-from artemis_edge.frames import F32, F64, I32, Bool
+from artemis_edge.frames import F32, F64, I32
 
 DEFAULT_THRESHOLDS = (0.1,)
 _SAMPLES_PER_TAU2 = 10.0
@@ -114,8 +115,8 @@ def evaluate_mesh(
     ``crop`` leaves out samples outside the reference's bounding box + tau. Raises InputError when the
     reference or the (cropped) mesh is empty or a threshold is not positive.
     """
-    good_point = _finite(reference)
-    good_face = _finite(mesh.vertices)[mesh.faces].all(axis=1)
+    good_point = finite_rows(reference)
+    good_face = finite_rows(mesh.vertices)[mesh.faces].all(axis=1)
     reference, faces = reference[good_point], mesh.faces[good_face]
     if len(reference) == 0:
         raise InputError("the reference cloud has no points; give a cloud of the same scene")
@@ -132,11 +133,6 @@ def evaluate_mesh(
             "triangles": int(np.count_nonzero(~good_face)),
         },
     )
-
-
-def _finite(points: F32) -> Bool:
-    finite: Bool = np.logical_and.reduce(np.isfinite(points), axis=1)
-    return finite
 
 
 def _compare(vertices: F32, faces: I32, reference: F32, tau: float, crop: bool) -> Comparison:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from artemis_edge.frames import F32, F64, I32, U8
+from artemis_edge.frames import F32, F64, I32, U8, Bool
 
 _GREY = 128
 
@@ -64,8 +64,18 @@ def bare_mesh(
     )
 
 
+def finite_rows(points: F32 | F64) -> Bool:
+    """Which rows of (n, k) have only finite numbers, bool (n,)."""
+    finite: Bool = np.logical_and.reduce(np.isfinite(points), axis=1)
+    return finite
+
+
 def vertex_normals(vertices: F32, faces: I32) -> F32:
-    """Unit normals float32 (n, 3): mean of the adjoining triangles by area; zero where there are none."""
+    """Unit normals float32 (n, 3): mean of the adjoining triangles by area; zero where there are none.
+
+    Triangles with a corner that is not finite count as none.
+    """
+    faces = faces[finite_rows(vertices)[faces].all(axis=1)]
     corner = vertices[faces].astype(np.float64)
     doubled = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     total = np.zeros((len(vertices), 3))

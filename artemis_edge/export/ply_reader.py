@@ -110,9 +110,9 @@ def _parse_line(words: list[str], header: _Header) -> None:
             header.byte_order = _BYTE_ORDER[name]
         case ["comment", "label", number, *name] if number.isdecimal() and name:
             header.label_names[int(number)] = " ".join(name)
-        case ["element", name, count]:
+        case ["element", name, count] if count.isdecimal():
             header.elements.append(_Element(name, int(count)))
-        case ["property", "list", count_kind, kind, name]:
+        case ["property", "list", count_kind, kind, name] if _TYPES[count_kind][0] != "f":
             header.elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[count_kind]))
         case ["property", kind, name]:
             header.elements[-1].properties.append(_Property(name, _TYPES[kind]))
@@ -235,8 +235,10 @@ def _read_ascii_rows(numbers: F64, offset: int, element: _Element) -> int:
             if p.count_kind is not None:
                 if offset >= len(numbers):
                     raise _truncated(element)
+                if not numbers[offset] >= 0 or numbers[offset] > len(numbers) - offset - 1:
+                    raise _truncated(element)
                 length, offset = int(numbers[offset]), offset + 1
-            if length < 0 or offset + length > len(numbers):
+            elif offset >= len(numbers):
                 raise _truncated(element)
             parts[k].append(numbers[offset : offset + length])
             offset += length
@@ -249,7 +251,8 @@ def _read_ascii_rows(numbers: F64, offset: int, element: _Element) -> int:
 
 def _typed(values: F64, kind: str) -> NDArray[Any]:
     if kind[0] == "f":
-        return values.astype(kind)
+        with np.errstate(over="ignore"):
+            return values.astype(kind)
     limits = np.iinfo(kind)
     if not np.all((values >= limits.min) & (values <= limits.max)):
         raise _MalformedError(
@@ -293,8 +296,9 @@ def _columns(vertex: _Element, names: tuple[str, ...]) -> F32 | None:
     if not scalars.issuperset(names):
         return None
     out = np.empty((vertex.count, len(names)), np.float32)
-    for k, name in enumerate(names):
-        out[:, k] = vertex.data.get(name, ())
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, as any other useless point
+        for k, name in enumerate(names):
+            out[:, k] = vertex.data.get(name, ())
     return out
 
 
@@ -328,6 +332,8 @@ def _triangles(face: _Element, vertices: int) -> I32:
             return np.empty((0, 3), np.int32)
         raise _MalformedError("its faces have no list of vertex_indices")
     flat, lengths = face.data[name]
+    if flat.dtype.kind == "f":
+        raise _MalformedError("its faces name vertices by fractions")
     flat = flat.astype(np.int64)
     if len(flat) and not (flat.min() >= 0 and flat.max() < vertices):
         raise _MalformedError(f"a face names a vertex outside 0..{vertices - 1}")

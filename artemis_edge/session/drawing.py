@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from artemis_edge.frames import F32, F64, U8, Bool
+from artemis_edge.export.mesh import finite_rows
+from artemis_edge.frames import F32, F64, U8
 
 Colour = tuple[int, int, int]
 
@@ -60,7 +61,7 @@ def text_width(words: str, size_px: float = 14.0) -> int:
 
 def polyline(image: U8, pixels: F64, colour: Colour = PATH, width: int = 2) -> None:
     """Draw a line through pixels float64 (n, 2) on a pale casing; rows with NaN interrupt it."""
-    finite: Bool = np.logical_and.reduce(np.isfinite(pixels), axis=1)
+    finite = finite_rows(pixels)
     for run in np.split(np.arange(len(pixels)), np.flatnonzero(np.diff(finite.astype(np.int8))) + 1):
         if len(run) > 1 and finite[run[0]]:
             corners = np.rint(pixels[run] * 16).clip(-(1 << 20), 1 << 20).astype(np.int32)

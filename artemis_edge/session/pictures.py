@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from artemis_edge.evaluate.mesh import Comparison, MeshEvaluation
-from artemis_edge.export.ply import Mesh
+from artemis_edge.export.mesh import Mesh, finite_rows
 from artemis_edge.frames import F32, F64, U8, CameraModel, Trajectory
 from artemis_edge.raster import Projection
 from artemis_edge.render import Rendering, View, from_above, perspective, render, write_png
@@ -49,8 +49,8 @@ def scene(mesh: Mesh, trajectory: Trajectory) -> Scene:
     R = _upright(trajectory)
     path = trajectory.T_world_lidar[:, :3, 3] @ R.T
     vertices = (mesh.vertices @ R.T.astype(np.float32)).astype(np.float32)
-    finite = vertices[np.isfinite(vertices).all(axis=1)]
-    ends = [path[np.isfinite(path).all(axis=1)]]
+    finite = vertices[finite_rows(vertices)]
+    ends = [path[finite_rows(path)]]
     if len(finite):
         ends.append(np.percentile(finite, [_TRIM_PERCENT, 100.0 - _TRIM_PERCENT], axis=0))
     corners = np.concatenate([*ends, np.zeros((0, 3))])
