@@ -11,7 +11,7 @@ import numpy as np
 
 from artemis_edge.config import OdometryConfig
 from artemis_edge.frames import F64
-from artemis_edge.odometry.motion import Motion, Prediction
+from artemis_edge.odometry.motion import Prediction
 from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import Registration, arm_m, judge, register
 from artemis_edge.odometry.search import guesses
@@ -35,11 +35,11 @@ class Aligner:
         self._usual_score = 0.0
         self._usual_miss2 = 0.0
 
-    def align(self, scan: TimedPoints, motion: Motion, prediction: Prediction) -> Registration | None:
+    def align(self, scan: TimedPoints, prediction: Prediction) -> Registration | None:
         """Pose of a scan, or None if it does not fit the map anywhere near the prediction."""
         if len(scan.points) < _MIN_MATCHES:
             return None
-        best = self._best(scan, motion, prediction)
+        best = self._best(scan, prediction)
         if best.matches < _MIN_MATCHES or best.score < _LOST * self._usual_score:
             return None
         miss = prediction.missed_by_m(best.T_world_lidar, arm_m(scan.points))
@@ -48,31 +48,29 @@ class Aligner:
         self._usual_miss2 += _MEMORY * (miss**2 - self._usual_miss2)
         return best
 
-    def refine(
-        self, scan: TimedPoints, motion: Motion, prediction: Prediction, T: F64
-    ) -> Registration | None:
+    def refine(self, scan: TimedPoints, prediction: Prediction, T: F64) -> Registration | None:
         """Register from a guess T_world_lidar known to be close."""
-        found = self._register(scan, motion, prediction, T, self._config.sigma_m)
+        found = self._register(scan, prediction, T, self._config.sigma_m)
         return found if found.matches >= _MIN_MATCHES else None
 
-    def _best(self, scan: TimedPoints, motion: Motion, prediction: Prediction) -> Registration:
+    def _best(self, scan: TimedPoints, prediction: Prediction) -> Registration:
         bound = prediction.reach_m(arm_m(scan.points))
         best = Registration(prediction.T_world_lidar, np.zeros((3, 3)), 0, 0.0)
         for tau in (min(self._usual_miss2**0.5, bound), bound):
-            found = self._register(scan, motion, prediction, prediction.T_world_lidar, tau)
+            found = self._register(scan, prediction, prediction.T_world_lidar, tau)
             best = max(best, found, key=_score)
             if best.score >= _GOOD * self._usual_score > 0.0:
                 return best
         basin = _BASIN * self._config.voxel_m
-        for guess in self._search(scan, motion, prediction, basin):
-            best = max(best, self._register(scan, motion, prediction, guess, basin), key=_score)
+        for guess in self._search(scan, prediction, basin):
+            best = max(best, self._register(scan, prediction, guess, basin), key=_score)
         return best
 
-    def _search(self, scan: TimedPoints, motion: Motion, prediction: Prediction, basin_m: float) -> list[F64]:
+    def _search(self, scan: TimedPoints, prediction: Prediction, basin_m: float) -> list[F64]:
         """The few best of the guesses within reach, the last pose among them (a carrier may stop at once)."""
         few = TimedPoints(*(a[:: max(len(scan.points) // _JUDGED, 1)] for a in scan))
         tried = [
-            motion.T_world_lidar,
+            prediction.T_world_start,
             *guesses(
                 prediction.T_world_lidar,
                 prediction.sigma_m,
@@ -84,14 +82,12 @@ class Aligner:
         level, sigma = self._map.level_of(basin_m), 0.5 * basin_m
         scores = []
         for T in tried:
-            points = few.at_stamp(motion.twist_to(T, prediction.elapsed_s))
+            points = few.at_one_time(prediction.twist(T))
             scores.append(judge(self._map, points, T, sigma, level).score)
         return [tried[k] for k in np.argsort(scores, kind="stable")[::-1][:_REFINED]]
 
-    def _register(
-        self, scan: TimedPoints, motion: Motion, prediction: Prediction, guess: F64, tau_m: float
-    ) -> Registration:
-        return register(self._map, scan, motion, prediction, guess, tau_m, self._config.sigma_m)
+    def _register(self, scan: TimedPoints, prediction: Prediction, guess: F64, tau_m: float) -> Registration:
+        return register(self._map, scan, prediction, guess, tau_m, self._config.sigma_m)
 
 
 def _score(found: Registration) -> float:

@@ -1,4 +1,7 @@
-"""What plain odometry takes from an IMU: which way is up at the start, and how fast the sensor turns."""
+"""What plain odometry takes from an IMU: which way is up at the start, and how fast the sensor turns.
+
+Samples come in the axes of the LiDAR (the readers turn them).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ _GRAVITY = 9.81
 _STEADY = 0.3  # accepted deviation of the mean specific force from gravity, as a share of it
 
 
-def levelling(imu: ImuSamples, R_lidar_imu: F64) -> F64:
+def levelling(imu: ImuSamples) -> F64:
     """Rotation (3, 3) R_world_lidar that turns the measured up to z by the shortest way, or identity.
 
     Accelerometers at rest measure the reaction to gravity, which points up. Samples whose mean is not about
@@ -18,7 +21,7 @@ def levelling(imu: ImuSamples, R_lidar_imu: F64) -> F64:
     """
     if len(imu.accel) == 0:
         return np.eye(3)
-    force: F64 = R_lidar_imu @ imu.accel.mean(axis=0)
+    force: F64 = imu.accel.mean(axis=0)
     strength = float(np.linalg.norm(force))
     if not abs(strength - _GRAVITY) <= _STEADY * _GRAVITY:
         return np.eye(3)
@@ -48,6 +51,12 @@ def join(before: ImuSamples, after: ImuSamples) -> ImuSamples:
 
 
 def mean_rate(imu: ImuSamples, start_ns: int, stop_ns: int) -> F64 | None:
-    """Mean angular velocity (3,) rad/s of the samples within a time, in the IMU's frame; None without any."""
+    """Mean angular velocity (3,) of the samples within a time, rad/s in their axes; None without any."""
     inside = (imu.stamp_ns > start_ns) & (imu.stamp_ns <= stop_ns)
     return imu.gyro[inside].mean(axis=0) if inside.any() else None
+
+
+def since(imu: ImuSamples, stamp_ns: int) -> ImuSamples:
+    """The samples after a time."""
+    keep = imu.stamp_ns > stamp_ns
+    return ImuSamples(imu.stamp_ns[keep], imu.gyro[keep], imu.accel[keep])

@@ -5,17 +5,20 @@ The filter (IMU, images) of a later version takes this place and keeps ``Odometr
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from artemis_edge.config import OdometryConfig
 from artemis_edge.frames import F64, ImuSamples, SyncedFrame, TrackedFrame
 from artemis_edge.odometry import imu as inertial
+from artemis_edge.odometry import se3
 from artemis_edge.odometry.aligner import Aligner
 from artemis_edge.odometry.deskew import deskew_frame
 from artemis_edge.odometry.motion import Motion, Prediction
 from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import DEGENERATE, Registration
-from artemis_edge.odometry.thin import Thinner, TimedPoints
+from artemis_edge.odometry.thin import Thinner, ThinScan, TimedPoints
 
 _START_ROUNDS = 2  # the first scan is corrected with the motion found and the second registered again
 _GIVE_UP = 10  # frames lost in a row after which the map is begun anew at the predicted pose
@@ -23,22 +26,29 @@ _EVICT_TRAVEL = 0.25  # share of the range travelled after which far voxels are 
 _FULL = 0.8  # share of the voxels in use from which room is made
 
 
+class _First(NamedTuple):
+    """The scan that began the map: pose at its frame's stamp, its middle time after that (s), its points."""
+
+    T_world_lidar: F64
+    lead_s: float
+    dense: TimedPoints
+
+
 class LidarOdometry:
     """Pose of every frame from its scans; world is the first LiDAR frame, levelled (z up) if there is an IMU.
 
-    ``T_imu_lidar`` (4, 4) is the mounting of the IMU. ``lost`` counts by reason the frames that could not be
-    registered and got the predicted pose, and the ``restarts`` of the map.
+    ``lost`` counts by reason the frames that could not be registered and got the predicted pose, and restarts
+    of the map.
     """
 
-    def __init__(self, config: OdometryConfig, T_imu_lidar: F64 | None = None) -> None:
+    def __init__(self, config: OdometryConfig) -> None:
         self.lost: dict[str, int] = {}
         self._config = config
-        self._R_lidar_imu: F64 = np.eye(3) if T_imu_lidar is None else T_imu_lidar[:3, :3].T
         self._thinner = Thinner(config)
         self._map = PlaneMap(config.voxel_m, config.levels, config.max_voxels)
         self._aligner = Aligner(config, self._map)
         self._motion: Motion | None = None
-        self._first: TimedPoints | None = None  # the scan that began the map, until its motion is known
+        self._first: _First | None = None  # until its motion is known
         self._imu = ImuSamples.empty()
         self._lost_in_a_row = 0
         self._evicted_at = np.zeros(3)
@@ -52,69 +62,60 @@ class LidarOdometry:
         """Register a frame and add it to the local map; a frame without scans gets the predicted pose."""
         self._imu = inertial.join(self._imu, frame.imu)
         if not frame.scans:
-            return self._as_predicted(frame)
-        dense, sparse = self._thinner.thin(frame)
+            return self._tracked(frame)
+        scan = self._thinner.thin(frame)
         if self._motion is None:
-            return self._begin(frame, dense)
-        prediction = self._predict(self._motion, frame.stamp_ns)
-        found = self._aligner.align(sparse, self._motion, prediction)
+            return self._begin(frame, scan)
+        prediction = self._motion.predict(scan.stamp_ns, self._config, self._imu)
+        found = self._aligner.align(scan.sparse, prediction)
         if found is not None and self._first is not None:
-            found = self._correct_first(self._first, sparse, self._motion, prediction, found)
+            prediction, found = self._correct_first(self._first, scan, prediction, found)
         if found is None:
-            return self._fall_back(frame, dense)
-        return self._accept(frame, dense, self._motion, found)
+            return self._fall_back(frame, scan)
+        self._accept(scan, found.T_world_lidar, prediction.twist(found.T_world_lidar))
+        return self._tracked(frame, bool(np.linalg.eigvalsh(found.N)[0] < DEGENERATE))
 
-    def _begin(self, frame: SyncedFrame, dense: TimedPoints) -> TrackedFrame:
+    def _begin(self, frame: SyncedFrame, scan: ThinScan) -> TrackedFrame:
         """The first scan makes the map; an empty one waits for the next."""
-        T = np.eye(4)
-        if len(dense.points) == 0:
+        if len(scan.dense.points) == 0:
             self._count("no points")
-        else:
-            T[:3, :3] = inertial.levelling(self._imu, self._R_lidar_imu)
-            self._seed(T, frame.stamp_ns, dense)
-        return _tracked(frame, T, np.zeros(6))
+            return self._tracked(frame)
+        T = np.eye(4)
+        T[:3, :3] = inertial.levelling(self._imu)
+        self._seed(T, frame.stamp_ns, scan)
+        return self._tracked(frame)
 
-    def _seed(self, T_world_lidar: F64, stamp_ns: int, dense: TimedPoints) -> None:
-        self._motion = Motion(T_world_lidar, stamp_ns, np.zeros(6))
-        self._first = dense
+    def _seed(self, T_world_lidar: F64, stamp_ns: int, scan: ThinScan) -> None:
+        """Begin the map with a scan, at a pose that holds at the frame's stamp."""
+        self._motion = Motion(T_world_lidar, scan.stamp_ns, np.zeros(6))
+        self._first = _First(T_world_lidar, (scan.stamp_ns - stamp_ns) * 1e-9, scan.dense)
         self._map.clear()
-        self._map.insert(dense.points, T_world_lidar)
+        self._map.insert(scan.dense.points, T_world_lidar)
         self._evicted_at = T_world_lidar[:3, 3]
 
-    def _predict(self, motion: Motion, stamp_ns: int) -> Prediction:
-        rate = inertial.mean_rate(self._imu, motion.stamp_ns, stamp_ns)
-        return motion.predict(stamp_ns, self._config, None if rate is None else self._R_lidar_imu @ rate)
-
     def _correct_first(
-        self,
-        first: TimedPoints,
-        scan: TimedPoints,
-        motion: Motion,
-        prediction: Prediction,
-        found: Registration,
-    ) -> Registration | None:
-        """Rebuild the map from the first scan with the motion now known, and register the second again."""
+        self, first: _First, scan: ThinScan, prediction: Prediction, found: Registration
+    ) -> tuple[Prediction, Registration | None]:
+        """Make the map anew from the first scan with the motion now known, and register the second again."""
         refined: Registration | None = found
         for _ in range(_START_ROUNDS):
             if refined is None:
                 break
+            twist = prediction.twist(refined.T_world_lidar)
+            T_old_new = se3.inverse(prediction.T_world_start) @ refined.T_world_lidar
+            prediction = prediction.rebased(first.T_world_lidar @ se3.exp(first.lead_s * twist))
             self._map.clear()
-            twist = motion.twist_to(refined.T_world_lidar, prediction.elapsed_s)
-            self._map.insert(first.at_stamp(twist), motion.T_world_lidar)
-            refined = self._aligner.refine(scan, motion, prediction, refined.T_world_lidar)
-        return refined
+            self._map.insert(first.dense.at_one_time(twist), prediction.T_world_start)
+            refined = self._aligner.refine(scan.sparse, prediction, prediction.T_world_start @ T_old_new)
+        return prediction, refined
 
-    def _accept(
-        self, frame: SyncedFrame, dense: TimedPoints, motion: Motion, found: Registration
-    ) -> TrackedFrame:
-        motion = motion.reached(found.T_world_lidar, frame.stamp_ns)
-        self._motion, self._first, self._lost_in_a_row = motion, None, 0
-        self._imu = ImuSamples.empty() if len(self._imu.stamp_ns) == 0 else _latest(self._imu, frame.stamp_ns)
-        self._make_room(motion.T_world_lidar[:3, 3])
-        if refused := self._map.insert(dense.at_stamp(motion.twist), motion.T_world_lidar):
+    def _accept(self, scan: ThinScan, T_world_lidar: F64, twist: F64) -> None:
+        self._motion = Motion(se3.orthonormal(T_world_lidar), scan.stamp_ns, twist, known=True)
+        self._first, self._lost_in_a_row = None, 0
+        self._imu = inertial.since(self._imu, scan.stamp_ns)
+        self._make_room(T_world_lidar[:3, 3])
+        if refused := self._map.insert(scan.dense.at_one_time(twist), T_world_lidar):
             self._count("points without room in the local map", refused)
-        degenerate = bool(np.linalg.eigvalsh(found.N)[0] < DEGENERATE)
-        return _tracked(frame, motion.T_world_lidar, motion.twist, degenerate)
 
     def _make_room(self, place: F64) -> None:
         travelled = float(np.linalg.norm(place - self._evicted_at))
@@ -123,31 +124,22 @@ class LidarOdometry:
             self._map.evict(place, self._config.max_range_m)
             self._evicted_at = place
 
-    def _fall_back(self, frame: SyncedFrame, dense: TimedPoints) -> TrackedFrame:
+    def _fall_back(self, frame: SyncedFrame, scan: ThinScan) -> TrackedFrame:
         """The frame could not be registered: the predicted pose, and after many in a row a new map there."""
-        self._count("no points" if len(dense.points) == 0 else "not registered")
+        self._count("no points" if len(scan.dense.points) == 0 else "not registered")
         self._lost_in_a_row += 1
-        tracked = self._as_predicted(frame)
-        if self._lost_in_a_row >= _GIVE_UP and len(dense.points):
+        tracked = self._tracked(frame)
+        if self._lost_in_a_row >= _GIVE_UP and len(scan.dense.points):
             self._count("restarts")
-            self._seed(tracked.T_world_lidar, frame.stamp_ns, dense)
+            self._seed(tracked.T_world_lidar, frame.stamp_ns, scan)
             self._lost_in_a_row = 0
         return tracked
 
-    def _as_predicted(self, frame: SyncedFrame) -> TrackedFrame:
-        if self._motion is None:
-            return _tracked(frame, np.eye(4), np.zeros(6))
-        return _tracked(frame, self._predict(self._motion, frame.stamp_ns).T_world_lidar, self._motion.twist)
+    def _tracked(self, frame: SyncedFrame, degenerate: bool = False) -> TrackedFrame:
+        """The frame with the pose that the present motion has at its stamp."""
+        T = np.eye(4) if self._motion is None else self._motion.pose_at(frame.stamp_ns)
+        scans = deskew_frame(frame, self.twist)
+        return TrackedFrame(frame.index, frame.stamp_ns, T, scans, degenerate, frame.images)
 
     def _count(self, reason: str, number: int = 1) -> None:
         self.lost[reason] = self.lost.get(reason, 0) + number
-
-
-def _latest(imu: ImuSamples, stamp_ns: int) -> ImuSamples:
-    keep = imu.stamp_ns > stamp_ns
-    return ImuSamples(imu.stamp_ns[keep], imu.gyro[keep], imu.accel[keep])
-
-
-def _tracked(frame: SyncedFrame, T_world_lidar: F64, twist: F64, degenerate: bool = False) -> TrackedFrame:
-    scans = deskew_frame(frame, twist)
-    return TrackedFrame(frame.index, frame.stamp_ns, T_world_lidar, scans, degenerate, frame.images)

@@ -7,20 +7,39 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from artemis_edge.config import OdometryConfig
-from artemis_edge.frames import F64
+from artemis_edge.frames import F64, ImuSamples
 from artemis_edge.odometry import se3
+from artemis_edge.odometry.imu import mean_rate
 
 _SAME_TIME_S = 1e-3  # frames that share a stamp are taken to be a millisecond apart
+_HALF_SCAN_NS = 50_000_000  # a frame is a window of 100 ms
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Guess of a frame's pose, and one deviation of its place (m) and of its attitude (rad)."""
+    """Guess of a scan's pose, one deviation of its place (m) and attitude (rad), and where it came from.
 
+    ``turn_rate`` (3,) rad/s is what a gyroscope measured during the scan, or None.
+    """
+
+    T_world_start: F64
     T_world_lidar: F64
     elapsed_s: float
     sigma_m: float
     sigma_rad: float
+    turn_rate: F64 | None = None
+
+    def twist(self, T_world_lidar: F64) -> F64:
+        """Body twist (6,) during the scan if this is its pose: the mean on the way, its turn as measured."""
+        twist: F64 = se3.log(se3.inverse(self.T_world_start) @ T_world_lidar) / self.elapsed_s
+        if self.turn_rate is not None:
+            twist[3:] = self.turn_rate
+        return twist
+
+    def rebased(self, T_world_start: F64) -> Prediction:
+        """The same motion from another start."""
+        T_new_old = T_world_start @ se3.inverse(self.T_world_start)
+        return replace(self, T_world_start=T_world_start, T_world_lidar=T_new_old @ self.T_world_lidar)
 
     def information(self) -> F64:
         """Inverse covariance (6, 6) of a right perturbation of the pose."""
@@ -38,15 +57,20 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Pose, body twist (6,) and stamp of the last registered frame; ``known``: it was measured."""
+    """Pose, body twist (6,) and time of the last registered scan; ``known``: the twist was measured."""
 
     T_world_lidar: F64
     stamp_ns: int
     twist: F64
     known: bool = False
 
-    def predict(self, stamp_ns: int, config: OdometryConfig, turn_rate: F64 | None = None) -> Prediction:
-        """Constant velocity to a later stamp; a measured ``turn_rate`` (3,) rad/s (lidar frame) wins.
+    def pose_at(self, stamp_ns: int) -> F64:
+        """T_world_lidar (4, 4) at a time near the scan's, by constant velocity."""
+        pose: F64 = self.T_world_lidar @ se3.exp((stamp_ns - self.stamp_ns) * 1e-9 * self.twist)
+        return pose
+
+    def predict(self, stamp_ns: int, config: OdometryConfig, imu: ImuSamples) -> Prediction:
+        """Constant velocity to a later scan; the turn as ``imu`` measured it, where it has samples.
 
         The deviation is what the stated accelerations can do in the time; while the velocity is not known
         (the second frame), what the stated starting speeds can do.
@@ -58,19 +82,10 @@ class Motion:
         if not self.known:
             sigma_m += config.start_speed * elapsed
             sigma_rad += config.start_turn * elapsed
-        if turn_rate is not None:
-            twist[3:] = turn_rate
+        rate = mean_rate(imu, self.stamp_ns, stamp_ns)
+        if rate is not None:
+            twist[3:] = rate
             sigma_rad = config.gyro_sigma * elapsed
-        return Prediction(self.T_world_lidar @ se3.exp(elapsed * twist), elapsed, sigma_m, sigma_rad)
-
-    def reached(self, T_world_lidar: F64, stamp_ns: int) -> Motion:
-        """The motion after a frame was registered at this pose."""
-        elapsed = (stamp_ns - self.stamp_ns) * 1e-9
-        if elapsed <= 0.0:
-            return replace(self, T_world_lidar=T_world_lidar)
-        return Motion(se3.orthonormal(T_world_lidar), stamp_ns, self.twist_to(T_world_lidar, elapsed), True)
-
-    def twist_to(self, T_world_lidar: F64, elapsed_s: float) -> F64:
-        """Body twist (6,) that leads from here to a pose in the given time."""
-        motion: F64 = se3.log(se3.inverse(self.T_world_lidar) @ T_world_lidar)
-        return motion / elapsed_s
+        T = self.T_world_lidar @ se3.exp(elapsed * twist)
+        during = mean_rate(imu, stamp_ns - _HALF_SCAN_NS, stamp_ns + _HALF_SCAN_NS)
+        return Prediction(self.T_world_lidar, T, elapsed, sigma_m, sigma_rad, during)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from artemis_edge._jit import inline, njit
+from artemis_edge._jit import njit
 from artemis_edge.frames import F32, F64, I64, Bool
 from artemis_edge.odometry.eigen3 import eigh3
 
@@ -110,14 +110,14 @@ class PlaneMap:
         return rows[:, NORMAL : NORMAL + 3], rows[:, CENTRE : CENTRE + 3], rows[:, THICKNESS]
 
 
-@inline
+@njit
 def cell_key(level: int, x: int, y: int, z: int) -> int:
     """Key of the voxel (x, y, z) of a level, counted in voxels of that level."""
     upper = ((level << _AXIS_BITS) | (x + _HALF)) << _AXIS_BITS
     return ((upper | (y + _HALF)) << _AXIS_BITS) | (z + _HALF)
 
 
-@inline
+@njit
 def voxel_key(level: int, x: int, y: int, z: int) -> int:
     """Key of the voxel of a level that holds the finest voxel (x, y, z)."""
     key: int = cell_key(level, x >> level, y >> level, z >> level)

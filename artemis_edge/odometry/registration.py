@@ -19,7 +19,7 @@ import numpy as np
 from artemis_edge._jit import njit
 from artemis_edge.frames import F32, F64
 from artemis_edge.odometry import se3
-from artemis_edge.odometry.motion import Motion, Prediction
+from artemis_edge.odometry.motion import Prediction
 from artemis_edge.odometry.plane_map import (
     CENTRE,
     COUNT,
@@ -70,7 +70,6 @@ class Linearised(NamedTuple):
 def register(
     plane_map: PlaneMap,
     scan: TimedPoints,
-    motion: Motion,
     prediction: Prediction,
     guess: F64,
     tau_m: float,
@@ -83,7 +82,7 @@ def register(
     T, arm = guess, arm_m(scan.points)
     level, matched, moved = -1, np.empty((0, _MATCH_COLUMNS)), 0.0
     for _ in range(_PASSES):
-        points = scan.at_stamp(motion.twist_to(T, prediction.elapsed_s))
+        points = scan.at_one_time(prediction.twist(T))
         stale = True
         for _ in range(_ITERATIONS):
             finest = plane_map.level_of(2.0 * tau_m)
@@ -102,7 +101,7 @@ def register(
 def judge(
     plane_map: PlaneMap, points: F32, T_world_lidar: F64, sigma_m: float, finest: int = 0
 ) -> Registration:
-    """How well points float32 (n, 3) at the stamp fit the map at a pose."""
+    """How well points float32 (n, 3) of one time fit the map at a pose."""
     lin = linearise(match(plane_map, points, T_world_lidar, finest, sigma_m**2), T_world_lidar, sigma_m**2)
     return Registration(T_world_lidar, lin.N, lin.matches, lin.weight / max(len(points), 1))
 

@@ -18,18 +18,29 @@ _CLOSE = 1.3  # number of points accepted, as a ratio to what was asked for
 
 
 class TimedPoints(NamedTuple):
-    """Points float32 (n, 3) in the lidar frame at their own times float32 (n,), s from the frame's stamp."""
+    """Points float32 (n, 3) in the lidar frame at their own times float32 (n,), s from a stamp."""
 
     points: F32
     time_s: F32
 
-    def at_stamp(self, twist: F64) -> F32:
-        """The points moved to the frame's stamp by a body twist (6,)."""
+    def at_one_time(self, twist: F64) -> F32:
+        """The points moved to one time by a body twist (6,)."""
         return np.asarray(move_points(self.points, self.time_s, 0.0, twist, np.eye(4)), np.float32)
 
     def take(self, rows: I64) -> TimedPoints:
         """Some of the points."""
         return TimedPoints(self.points[rows], self.time_s[rows])
+
+
+class ThinScan(NamedTuple):
+    """A frame thinned: its middle time, points for the map and points to register, times from that middle.
+
+    Registering the middle halves what an unsteady velocity does, whatever the stamp stands for.
+    """
+
+    stamp_ns: int
+    dense: TimedPoints
+    sparse: TimedPoints
 
 
 class Thinner:
@@ -42,13 +53,13 @@ class Thinner:
         self._config = config
         self._spacing_m = config.insert_m
 
-    def thin(self, frame: SyncedFrame) -> tuple[TimedPoints, TimedPoints]:
-        """Points for the map and points to register; points out of range or not finite are left out."""
+    def thin(self, frame: SyncedFrame) -> ThinScan:
+        """Thin a frame with at least one scan; points out of range or not finite are left out."""
         c = self._config
         parts = [self._dense(scan, frame.stamp_ns) for scan in frame.scans]
-        dense = TimedPoints(
-            np.concatenate([p.points for p in parts]), np.concatenate([p.time_s for p in parts])
-        )
+        points, time_s = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        middle_s = 0.5 * float(time_s.min() + time_s.max()) if len(time_s) else 0.0
+        dense = TimedPoints(points, time_s - np.float32(middle_s))
         for _ in range(_TRIES):
             rows = first_per_voxel(dense.points, self._spacing_m, 0.0, np.inf)
             ratio = len(rows) / c.points
@@ -56,7 +67,7 @@ class Thinner:
                 break
             # points lie on surfaces: their number goes with the square of the spacing
             self._spacing_m = max(c.insert_m, self._spacing_m * max(ratio, 0.1) ** 0.5)
-        return dense, dense.take(rows)
+        return ThinScan(frame.stamp_ns + round(middle_s * 1e9), dense, dense.take(rows))
 
     def _dense(self, scan: LidarScan, stamp_ns: int) -> TimedPoints:
         """Points for the map of one scan, in the lidar frame, their times relative to the frame's stamp."""
