@@ -42,6 +42,8 @@ IMAGES: dict[str, type[CompressedImage | Image]] = {
 }
 _M = TypeVar("_M", bound=Message)
 _TRANSFORMS = (TFMessage.ROS_TYPE, "tf/msg/tfMessage")
+# rad/s and m/s2: beyond it, and where it is NaN, a sample is garbage.
+_IMU_LIMIT = 1e5
 # A static transform stands in a message of its own topic, whatever the robot's prefix.
 _STATIC_TOPIC = "tf_static"
 
@@ -158,8 +160,8 @@ class BagIndex:
     def _imu(self, connection: Connection, entry: Entry) -> None:
         message = _read(Imu, connection, entry)
         value = np.concatenate([message.gyro, message.accel]).astype(np.float64)
-        if not np.isfinite(value).all():
-            raise CdrError("an IMU sample is not finite")
+        if not bool((np.abs(value) < _IMU_LIMIT).all()):
+            raise CdrError("an IMU sample is not a measurement")
         track = self.imus.setdefault(connection.topic, ImuTrack(message.header.frame_id))
         track.stamps.append(message.header.stamp_ns)
         track.logs.append(entry.log_ns)

@@ -91,6 +91,11 @@ def seconds_to_ns(text: str, where: str) -> int:
         raise InputError(f"{where} holds '{text[:40]}' where a time in seconds is expected") from None
 
 
+def one_line(error: Exception) -> str:
+    """What another library says, fit for one line."""
+    return " ".join(str(error).split())[:160]
+
+
 def read_lines(path: Path) -> list[str]:
     """Lines of a text file that hold something; InputError if it cannot be read."""
     try:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from artemis_edge.datasets.bag import WHOLE, ChunkCache, Connection, Entry
-from artemis_edge.datasets.common import add_counts
+from artemis_edge.datasets.common import add_counts, one_line
 from artemis_edge.errors import InputError
 from artemis_edge.session.cdr import Buffer, CdrError
 
@@ -29,7 +29,7 @@ class Ros1Bag:
 
     def __init__(self, path: Path) -> None:
         try:
-            from rosbags.rosbag1 import Reader, ReaderError
+            from rosbags.rosbag1 import Reader
         except ImportError:
             raise InputError(f"reading {path} needs rosbags; pip install 'artemis-edge[import]'") from None
         self.path = path
@@ -40,8 +40,9 @@ class Ros1Bag:
             self._reader = Reader(path)
             self._reader.open()
             weakref.finalize(self, self._reader.close)
-        except (ReaderError, OSError, ValueError) as error:
-            raise InputError(f"{path} cannot be read ({error}); repair it with 'rosbag reindex'") from None
+        except Exception as error:  # rosbags asserts what a damaged index denies
+            what = one_line(error) or type(error).__name__
+            raise InputError(f"{path} cannot be read ({what}); repair it with 'rosbag reindex'") from None
 
     def scan(self, needed: Callable[[Connection], int]) -> Iterator[Entry]:
         """Every message once, chunk by chunk."""

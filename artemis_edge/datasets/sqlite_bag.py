@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from artemis_edge.datasets.bag import WHOLE, Connection, Entry, ros2_type
-from artemis_edge.datasets.common import add_counts
+from artemis_edge.datasets.common import add_counts, one_line
 from artemis_edge.errors import InputError
 from artemis_edge.session.cdr import Buffer, CdrError
 
@@ -32,9 +32,9 @@ class SqliteBag:
             rows = self._database.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             ).fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise InputError(
-                f"{path} is not a ROS 2 bag in SQLite ({error}); record or convert it again"
+                f"{path} is not a ROS 2 bag in SQLite ({one_line(error)}); record or convert it again"
             ) from None
         self._topics = {row[0]: Connection(str(row[1]), ros2_type(str(row[2])), str(row[3])) for row in rows}
 
@@ -54,16 +54,18 @@ class SqliteBag:
                     yield Entry(connection, log_ns, data, row)
                 else:
                     add_counts(self.lost, {"undecodable_messages": 1})
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             add_counts(self.lost, {"truncated_file": 1})
-            self.warnings.append(f"{self.path} is damaged ({error}); part of {connection.topic} is missing")
+            self.warnings.append(
+                f"{self.path} is damaged ({one_line(error)}); part of {connection.topic} is missing"
+            )
 
     def fetch(self, where: Any) -> Buffer:
         """The whole message with this id."""
         try:
             row = self._database.execute("SELECT data FROM messages WHERE id = ?", (where,)).fetchone()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise CdrError(f"{self.path} is damaged: {error}") from None
-        if row is None:
+        if row is None or not isinstance(row[0], bytes):
             raise CdrError(f"{self.path} has no message {where}")
         return bytes(row[0])

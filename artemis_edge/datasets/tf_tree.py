@@ -9,7 +9,8 @@ import numpy as np
 from artemis_edge.frames import F64, I64, Bool, Trajectory
 from artemis_edge.trajectory import covered, interpolate, inverse, matrix_from_quaternion
 
-_TINY = 1e-6
+# A rotation shorter than this has no direction; a length beyond that is not on Earth.
+_TINY, _FAR_M = 1e-6, 1e9
 
 
 class _Edge:
@@ -69,7 +70,8 @@ class TransformTree:
         """One sample of ``T_parent_child``; one that is no transform is counted in ``broken``."""
         parent, child = parent.lstrip("/"), child.lstrip("/")
         value = np.concatenate([translation, rotation])
-        if parent == child or not np.isfinite(value).all() or np.linalg.norm(rotation) < _TINY:
+        plausible = bool((np.abs(value) < _FAR_M).all())
+        if parent == child or not plausible or np.linalg.norm(rotation) < _TINY:
             self.broken += 1
             return
         edge = self._edges.setdefault(child, {}).setdefault(parent, _Edge(moving))
