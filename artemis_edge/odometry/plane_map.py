@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from artemis_edge._jit import njit
+from artemis_edge.eigen3 import smallest_eigen3
 from artemis_edge.frames import F32, F64, I64, Bool
-from artemis_edge.odometry.eigen3 import eigh3
 
 EMPTY = -1
 _AXIS_BITS = 20  # +-2^19 voxels of 0.5 m are +-262 km
@@ -258,25 +258,30 @@ def refresh(table: Table, slot: int, voxel_m: float) -> bool:
 
 @njit
 def _fit(row: F64, key: int, voxel_m: float) -> None:
+    """Plane of the moments: normal, centre, thickness, in-plane spread; none where they are no thin sheet."""
     n, s = row[COUNT], row[MOMENTS:]
     mx, my, mz = s[0] / n, s[1] / n, s[2] / n
-    values, vectors = eigh3(
-        s[3] / n - mx * mx, s[4] / n - mx * my, s[5] / n - mx * mz,
-        s[6] / n - my * my, s[7] / n - my * mz, s[8] / n - mz * mz,
-    )  # fmt: skip
+    xx, xy, xz = s[3] / n - mx * mx, s[4] / n - mx * my, s[5] / n - mx * mz
+    yy, yz, zz = s[6] / n - my * my, s[7] / n - my * mz, s[8] / n - mz * mz
+    e = np.empty(6)
+    smallest_eigen3(xx, xy, xz, yy, yz, zz, e)
+    a, b, c, thin, middle, wide = e
     row[FITTED], row[THICKNESS] = n, -1.0
-    if not values[0] <= _MAX_THICKNESS * values[1]:
+    if not (thin <= _MAX_THICKNESS * middle and middle > 0.0):
         return
-    row[THICKNESS] = max(values[0], 0.0) * n / (n - 3.0)  # a plane leaves n - 3 degrees of freedom
+    row[THICKNESS] = max(thin, 0.0) * n / (n - 3.0)  # a plane leaves n - 3 degrees of freedom
+    row[NORMAL], row[NORMAL + 1], row[NORMAL + 2] = a, b, c
     cx, cy, cz = _corner(key, voxel_m)
     row[CENTRE], row[CENTRE + 1], row[CENTRE + 2] = mx + cx, my + cy, mz + cz
-    u, v, a, b = vectors[:, 1], vectors[:, 2], 1.0 / values[1], 1.0 / values[2]
-    k = SPREAD
-    for i in range(3):
-        row[NORMAL + i] = vectors[i, 0]
-        for j in range(i, 3):
-            row[k] = a * u[i] * u[j] + b * v[i] * v[j]
-            k += 1
+    # the inverse within the plane, by Cayley-Hamilton for the two in-plane eigenvalues
+    trace, inverse = middle + wide, 1.0 / (middle * wide)
+    m = row[SPREAD:]
+    m[0] = (trace * (1.0 - a * a) - xx + thin * a * a) * inverse
+    m[1] = (-trace * a * b - xy + thin * a * b) * inverse
+    m[2] = (-trace * a * c - xz + thin * a * c) * inverse
+    m[3] = (trace * (1.0 - b * b) - yy + thin * b * b) * inverse
+    m[4] = (-trace * b * c - yz + thin * b * c) * inverse
+    m[5] = (trace * (1.0 - c * c) - zz + thin * c * c) * inverse
 
 
 @njit
