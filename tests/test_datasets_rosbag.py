@@ -266,6 +266,20 @@ def test_images_go_to_the_nearest_frame(tmp_path: Path) -> None:
     assert got == [[MS, 40 * MS], [60 * MS, 61 * MS], [], [330 * MS]]
 
 
+def test_images_belong_to_the_window_they_were_taken_in(tmp_path: Path) -> None:
+    """A stamp is the start of a timed window: an image of its middle is this frame's, not the next one's."""
+    with SessionWriter(tmp_path / "a.mcap") as out:
+        out.write_tf_static(0, "lidar", "cam", np.eye(4))
+        out.write_camera_info(0, MODEL)
+        for k in range(4):
+            stamp = SECOND + k * 100 * MS
+            out.write_points(stamp, _points(), offset_ns=np.linspace(0, 99 * MS, 5).astype(int))
+            for share in (5, 50, 95):
+                out.write_image(stamp + share * MS, JPEG)
+    for frame in RosbagSource(tmp_path / "a.mcap").frames():
+        assert [(i.stamp_ns - frame.stamp_ns) // MS for i in frame.images] == [5, 50, 95]
+
+
 def test_an_image_far_from_every_frame_is_a_frame(tmp_path: Path) -> None:
     """A platform that stops, looks, and does not always scan."""
     records = [_tf(0, "lidar", name, np.eye(4), True) for name in ("cam", "cam2")]
@@ -497,6 +511,24 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 def test_a_recording_without_lidar(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no LiDAR clouds .* but /imu \(sensor_msgs/msg/Imu\)"):
         _open(tmp_path, [_imu(0)])
+
+
+def test_ros1_messages_in_mcap(tmp_path: Path) -> None:
+    """As converters of ROS 1 bags write them."""
+    kind, ros2 = PointCloud2.ROS_TYPE, get_typestore(Stores.ROS2_HUMBLE)
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        out = Writer(stream)
+        out.start("ros1", "x")
+        channel = out.register_channel(
+            "/p", "ros1", out.register_schema("sensor_msgs/PointCloud2", "ros1msg", b"")
+        )
+        for k in range(3):
+            data = bytes(ros2.cdr_to_ros1(_cloud(k * SECOND, value=k + 1)[1].encode(), kind))
+            out.add_message(channel, k, data, k)
+        out.finish()
+    frames = list(open_input(tmp_path / "a.mcap").frames())
+    assert [frame.stamp_ns for frame in frames] == [0, SECOND, 2 * SECOND]
+    assert [frame.scans[0].points[0, 0] for frame in frames] == [1, 2, 3]
 
 
 def test_other_encodings(tmp_path: Path) -> None:

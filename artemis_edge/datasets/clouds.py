@@ -34,8 +34,8 @@ class CloudFormat:
     """What the optional fields of a topic mean.
 
     ``time_field`` counts ``unit_s`` seconds: from the header's stamp, from the epoch (``absolute``) or, by
-    a clock of its own, from the first point (``own_clock``). ``full_intensity`` stands for 1. ``start_s`` is
-    the time of the first point of the first cloud relative to its stamp.
+    a clock of its own, from the first point (``own_clock``). ``full_intensity`` stands for 1. ``start_s`` and
+    ``end_s`` are the times of the first and last point of the first cloud relative to its stamp.
     """
 
     time_field: str | None = None
@@ -44,6 +44,7 @@ class CloudFormat:
     own_clock: bool = False
     full_intensity: float = 1.0
     start_s: float = 0.0
+    end_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +120,10 @@ def _settle(records: NDArray[Any], stamp_ns: int) -> CloudFormat:
     if np.abs(offset[np.isfinite(offset)]).max(initial=0.0) > _OTHER_CLOCK_S:
         settled = CloudFormat(time_field, unit, absolute, True, full)
         offset = _offset_s(records, settled, stamp_ns)
-    start = float(np.min(offset, initial=0.0, where=np.isfinite(offset)))
-    return CloudFormat(time_field, unit, absolute, settled.own_clock, full, start)
+    finite = np.isfinite(offset)
+    start = float(np.min(offset, initial=0.0, where=finite))
+    end = float(np.max(offset, initial=0.0, where=finite))
+    return CloudFormat(time_field, unit, absolute, settled.own_clock, full, start, end)
 
 
 def _time_unit(values: NDArray[Any]) -> tuple[float, bool]:

@@ -25,6 +25,7 @@ from artemis_edge.datasets.bag_sensors import (
     find_lidars,
     find_odometry,
 )
+from artemis_edge.datasets.clouds import CloudFormat
 from artemis_edge.datasets.common import (
     SECOND_NS,
     add_counts,
@@ -74,10 +75,11 @@ class RosbagSource:
         lidar_frame = self._lidars[0].track.frame_id
         self._cameras = find_cameras(index, config, lidar_frame)
         plans = _group_clouds(self._lidars, index)
-        self._plans = _attach_images(plans, self._cameras)
+        timing = self._lidars[0].format
+        self._plans = _attach_images(plans, self._cameras, timing)
         self.stamp_ns: I64 = np.array([plan.stamp_ns for plan in self._plans], np.int64)
         self._imu = find_imu(index, config, lidar_frame)
-        starts = self.stamp_ns + round(self._lidars[0].format.start_s * SECOND_NS)
+        starts = self.stamp_ns + round(timing.start_s * SECOND_NS)
         self._imu_bounds = split_imu(self._imu.stamp_ns, starts)
         self.poses: Trajectory | None = _poses(index, config, lidar_frame, self.stamp_ns)
         interval = median_interval_ns(self.stamp_ns)
@@ -176,11 +178,17 @@ def _group_clouds(lidars: list[Lidar], index: BagIndex) -> list[_Plan]:
     return plans
 
 
-def _attach_images(plans: list[_Plan], cameras: list[BagCamera]) -> list[_Plan]:
-    """Each image goes to the frame nearest in time; one far from all of them makes a frame of its own."""
-    stamps = np.array([plan.stamp_ns for plan in plans], np.int64)
-    interval = median_interval_ns(stamps)
-    reach = _NEAR_NS if interval is None else max(min(_NEAR_SHARE * interval, _NEAR_NS), _SAME_NS)
+def _attach_images(plans: list[_Plan], cameras: list[BagCamera], timing: CloudFormat) -> list[_Plan]:
+    """Each image goes to the frame nearest in time; one far from all of them makes a frame of its own.
+
+    The distance counts from the middle of a frame's window, and a window's own images are never far.
+    """
+    half_ns = round(0.5 * (timing.end_s - timing.start_s) * SECOND_NS)
+    middle_ns = round(timing.start_s * SECOND_NS) + half_ns
+    middles = np.array([plan.stamp_ns + middle_ns for plan in plans], np.int64)
+    interval = median_interval_ns(middles)
+    near = _NEAR_NS if interval is None else min(_NEAR_SHARE * interval, _NEAR_NS)
+    reach = max(near, half_ns + _SAME_NS)
     alone: list[_Plan] = []
     events = sorted(
         (int(stamp), number, k)
@@ -189,12 +197,13 @@ def _attach_images(plans: list[_Plan], cameras: list[BagCamera]) -> list[_Plan]:
         if camera.known[k]
     )
     for stamp, number, k in events:
-        plan = plans[_nearest(stamps, stamp)] if plans else None
-        if plan is None or abs(plan.stamp_ns - stamp) > reach:
-            if not alone or stamp - alone[-1].stamp_ns > _SAME_NS:
-                alone.append(_Plan(stamp))
-            plan = alone[-1]
-        plan.images.append((number, k))
+        nearest = _nearest(middles, stamp)
+        if abs(int(middles[nearest]) - stamp) <= reach:
+            plans[nearest].images.append((number, k))
+            continue
+        if not alone or stamp - alone[-1].stamp_ns > _SAME_NS:
+            alone.append(_Plan(stamp))
+        alone[-1].images.append((number, k))
     return sorted(plans + alone, key=lambda plan: plan.stamp_ns)
 
 
