@@ -23,10 +23,10 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from artemis_edge.config import InputConfig
-from artemis_edge.datasets import open_input
+from artemis_edge.datasets import lidar_poses, open_input
 from artemis_edge.datasets.rosbag import RosbagSource
 from artemis_edge.errors import InputError
-from artemis_edge.frames import F64, CameraModel, SyncedFrame
+from artemis_edge.frames import F64, CameraModel, SyncedFrame, Trajectory
 from artemis_edge.session.messages import (
     CameraInfo,
     CompressedImage,
@@ -203,6 +203,22 @@ def test_odometry_of_an_unknown_frame_is_taken_as_the_lidars(tmp_path: Path) -> 
 
 def test_no_poses(tmp_path: Path) -> None:
     assert _open(tmp_path, [_cloud(0), _cloud(SECOND)]).poses is None
+
+
+def test_given_poses_of_the_base_get_the_mounting(tmp_path: Path) -> None:
+    source = _open(tmp_path, _drive())
+    base = Trajectory(source.stamp_ns, np.array([_pose(0.1 * k + 0.01) for k in range(4)]))
+    of_lidar = lidar_poses(source, base)
+    assert source.poses is not None
+    np.testing.assert_allclose(of_lidar.T_world_lidar, source.poses.T_world_lidar, atol=1e-9)
+    assert any("those of base in tf" in text for text in source.warnings)
+    count = len(source.warnings)
+    np.testing.assert_allclose(
+        lidar_poses(source, of_lidar).T_world_lidar, of_lidar.T_world_lidar, atol=1e-12
+    )
+    other = Trajectory(base.stamp_ns, _pose(0, 0, 1.0) @ base.T_world_lidar)
+    assert lidar_poses(source, other) is other
+    assert len(source.warnings) == count
 
 
 def test_several_lidars_make_one_frame(tmp_path: Path) -> None:
@@ -663,6 +679,18 @@ def test_real_livox_scene() -> None:
             assert image.model.distortion == tuple(known["dist_k1k2p1p2k3"])
             seen += 1
     assert seen == 36 + 44
+
+
+@needs_data
+@pytest.mark.data
+def test_real_base_poses() -> None:
+    from artemis_edge.trajectory import pose_per_frame, read_tum
+
+    source = RosbagSource(DATA / "livox_cam_hku" / "split" / "input")
+    base = read_tum(DATA / "livox_cam_hku" / "split" / "input_base_poses.tum")
+    of_lidar = lidar_poses(source, pose_per_frame(base, source.stamp_ns))
+    assert source.poses is not None
+    np.testing.assert_allclose(of_lidar.T_world_lidar, source.poses.T_world_lidar, atol=1e-4)
 
 
 @needs_data

@@ -9,7 +9,7 @@ from artemis_edge.config import InputConfig
 from artemis_edge.datasets.kitti import open_odometry, open_raw
 from artemis_edge.datasets.rosbag import RosbagSource, bag_files
 from artemis_edge.errors import InputError
-from artemis_edge.frames import FrameSource
+from artemis_edge.frames import FrameSource, Trajectory
 
 _KINDS = "a session or ROS bag (.mcap, .db3, .bag) or a KITTI folder (with velodyne or velodyne_points)"
 
@@ -23,6 +23,11 @@ def open_input(path: Path, config: InputConfig | None = None) -> FrameSource:
     if opener is None:
         raise InputError(_unknown(path))
     return RosbagSource(path, config) if opener is RosbagSource else opener(path)
+
+
+def lidar_poses(source: FrameSource, given: Trajectory) -> Trajectory:
+    """Given poses as those of the primary LiDAR: see ``RosbagSource.lidar_poses``."""
+    return source.lidar_poses(given) if isinstance(source, RosbagSource) else given
 
 
 def _opener(path: Path) -> Callable[[Path], FrameSource] | None:

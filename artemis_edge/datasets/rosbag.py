@@ -46,6 +46,8 @@ _SAME_NS = 1_000_000
 _NEAR_SHARE = 0.75
 # ... and, where frames are rare, than this: the platform has moved on.
 _NEAR_NS = 300_000_000
+# Metres, and entries of a rotation: given poses this close to those of tf are the same.
+_SAME_POSE = 0.005
 # Rate of a recording with a single frame
 _NOMINAL_HZ = 10.0
 
@@ -86,6 +88,7 @@ class RosbagSource:
         self.input_hz = SECOND_NS / interval if interval else _NOMINAL_HZ
         self.lost: dict[str, int] = index.lost
         self.warnings: list[str] = index.warnings
+        self._tree, self._lidar_frame = index.tree, lidar_frame
 
     def __len__(self) -> int:
         return len(self._plans)
@@ -94,6 +97,24 @@ class RosbagSource:
         """Frames ``start <= index < stop`` in order of time, decoded one by one."""
         for index in range(*slice(start, stop).indices(len(self))):
             yield self._frame(index)
+
+    def lidar_poses(self, given: Trajectory) -> Trajectory:
+        """Poses of the primary LiDAR, given those of whatever part of the rig tf says they are of.
+
+        Pose files of a recording are often of its base. Where tf moves the base (or another frame above the
+        LiDAR) exactly so, the mounting is applied and a warning says so; otherwise the poses are the LiDAR's.
+        """
+        path = self._tree.path_up(self._lidar_frame)
+        for frame in path[:-1]:
+            T, known = self._tree.lookup(path[-1], frame, given.stamp_ns)
+            if known.all() and np.abs(T - given.T_world_lidar).max() < _SAME_POSE:
+                T_frame_lidar, _ = self._tree.lookup(frame, self._lidar_frame, given.stamp_ns)
+                if frame != path[0]:
+                    self.warnings.append(
+                        f"the given poses are those of {frame} in tf; the mounting of {path[0]} is applied"
+                    )
+                return Trajectory(given.stamp_ns, given.T_world_lidar @ T_frame_lidar)
+        return given
 
     def _frame(self, index: int) -> SyncedFrame:
         plan, lost = self._plans[index], dict[str, int]()

@@ -68,7 +68,7 @@ class CdrReader:
         return self._body[at : at + count]
 
     def structures(self, dtype: np.dtype[Any], count: int, last_size: int) -> NDArray[Any]:
-        """``count`` structures of a little-endian ``dtype``, padded but for the last of ``last_size`` bytes."""
+        """``count`` structures of a little-endian ``dtype``, the last of only ``last_size`` bytes."""
         if count == 0:
             return np.empty(0, dtype)
         at = self._take(4, (count - 1) * dtype.itemsize + last_size)
