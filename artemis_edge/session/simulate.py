@@ -20,13 +20,14 @@ from artemis_drivers.virtual import avia, street
 from artemis_drivers.virtual.camera import CameraSpec, VirtualCamera
 from artemis_drivers.virtual.imu import ImuRecord, ImuSpec, measure
 from artemis_drivers.virtual.lidar import Frame, LidarSpec, Pattern, scan
-from artemis_drivers.virtual.mesh_builder import WorldMesh, joined
+from artemis_drivers.virtual.mesh_builder import WorldMesh
 from artemis_drivers.virtual.motion import Motion
 from artemis_drivers.virtual.observable import HitStore, ObservedSurface, observed_surface
 from artemis_drivers.virtual.scene import Scene, Window
-from artemis_drivers.virtual.walk import path_needed_m, walk
+from artemis_drivers.virtual.walk import Gait, path_needed_m, walk
 from artemis_drivers.virtual.world import World
 from msgspec import Meta, Struct
+from scipy.spatial.transform import Rotation
 
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import replacing, write_bytes
@@ -53,8 +54,6 @@ T_IMU_LIDAR = np.array([[1, 0, 0, 0.04165], [0, 1, 0, 0.02326], [0, 0, 1, -0.028
 
 def _camera_mount() -> F64:
     """T_lidar_cam: optical axes (z forward, y down), 6 cm below the LiDAR, half a degree off square."""
-    from scipy.spatial.transform import Rotation
-
     T = np.eye(4)
     axes = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     T[:3, :3] = Rotation.from_euler("zyx", [0.5, 0.8, -0.4], degrees=True).as_matrix() @ axes
@@ -68,7 +67,9 @@ T_LIDAR_CAM = _camera_mount()
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     """What ``--set key=value`` can change."""
 
-    density: Annotated[float, Meta(gt=0, le=1, description="Share of the LiDAR's points that are kept.")] = 1.0
+    density: Annotated[float, Meta(gt=0, le=1, description="Share of the LiDAR's points that are kept.")] = (
+        1.0
+    )
     camera: Annotated[bool, Meta(description="Write photographs.")] = True
     camera_every: Annotated[int, Meta(ge=1, description="A photograph every so many LiDAR frames.")] = 1
     image_width: Annotated[int, Meta(ge=64, le=4096, description="Pixels; the height is 0.8 of it.")] = 640
@@ -79,9 +80,13 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     imu_noise: Annotated[float, Meta(ge=0, description="Factor on all noise and bias of the IMU.")] = 1.0
     speed: Annotated[float, Meta(gt=0, le=3, description="Walking speed, m/s.")] = 1.2
     length: Annotated[float, Meta(ge=0, description="Length of the street, m; 0: as the walk needs.")] = 0.0
-    reach_m: Annotated[float, Meta(ge=20, le=450, description="How far along the street the world is built.")] = 160.0  # fmt: skip
+    reach_m: Annotated[
+        float, Meta(ge=20, le=450, description="How far along the street the world is built.")
+    ] = 160.0
     mesh: Annotated[bool, Meta(description="Write truth/mesh.ply.")] = True
-    reference: Annotated[bool | None, Meta(description="Write truth/reference.ply (default: walks up to 300 s).")] = None  # fmt: skip
+    reference: Annotated[
+        bool | None, Meta(description="Write truth/reference.ply (default: walks up to 300 s).")
+    ] = None
     reference_spacing_m: Annotated[float, Meta(gt=0, description="Spacing of the reference's points.")] = 0.02
 
 
@@ -108,6 +113,7 @@ class _Rig:
     world: World
     motion: Motion
     pattern: Pattern
+    pattern_name: str
     lidar: LidarSpec
     imu: ImuRecord | None
     camera: VirtualCamera | None
@@ -171,24 +177,20 @@ def _build_rig(world_name: str, seed: int, seconds: float, lidar: str, s: Settin
         raise InputError(f"no virtual LiDAR named '{lidar}'; there are: {', '.join(LIDARS)}")
     if seed < 0:
         raise InputError(f"--seed {seed} is negative; give 0 or more")
-    from artemis_drivers.virtual.walk import Gait
-
     gait = Gait(speed=s.speed)
     needed = path_needed_m(seconds, gait) + 2 * street.END_MARGIN_M
     if 0 < s.length < needed:
-        raise InputError(f"a street of {s.length:g} m is too short for this walk; give length={np.ceil(needed):.0f} or more")  # fmt: skip
+        raise InputError(
+            f"a street of {s.length:g} m is too short for this walk; give length={np.ceil(needed):.0f}"
+        )
     world = street.build(seed, max(needed, s.length or 100.0))
-    motion = _lidar_starts_level(walk(world.path, seconds + 0.2, seed, gait))
+    # the walk is the IMU's; the LiDAR's axes are parallel to them, so it starts level, too
+    motion = walk(world.path, seconds + 0.2, seed, gait)
     imu = measure(motion, ImuSpec().scaled(s.imu_noise), seed, seconds) if s.imu else None
     spec = CameraSpec(jpeg_quality=s.jpeg_quality).scaled(s.image_width)
     camera = VirtualCamera(spec, rasterise, seed) if s.camera else None
     physics = LidarSpec(range_noise_m=s.range_noise_m, angular_noise=np.radians(s.angular_noise_deg))
-    return _Rig(world, motion, LIDARS[lidar], physics, imu, camera, s, seed)
-
-
-def _lidar_starts_level(motion: Motion) -> Motion:
-    """The walk is that of the IMU; the LiDAR's axes are parallel to the IMU's, so it starts level, too."""
-    return motion
+    return _Rig(world, motion, LIDARS[lidar], lidar, physics, imu, camera, s, seed)
 
 
 def rasterise(
@@ -253,7 +255,12 @@ def _camera_model(spec: CameraSpec) -> CameraModel:
 
 
 def _write_frame(
-    writer: SessionWriter, rig: _Rig, k: int, frame: Frame, photo: Future[bytes] | None, counts: dict[str, int]
+    writer: SessionWriter,
+    rig: _Rig,
+    k: int,
+    frame: Frame,
+    photo: Future[bytes] | None,
+    counts: dict[str, int],
 ) -> None:
     """Messages of one window in the order in which a host would receive them."""
     stamp = START_NS + k * FRAME_NS
@@ -266,8 +273,13 @@ def _write_frame(
     if photo is not None:
         _write_photo(writer, rig, middle, photo, counts)
     writer.write_points(
-        stamp, frame.points, intensity=frame.intensity, line=frame.line, offset_ns=frame.offset_ns, receive_ns=end
-    )  # fmt: skip
+        stamp,
+        frame.points,
+        intensity=frame.intensity,
+        line=frame.line,
+        offset_ns=frame.offset_ns,
+        receive_ns=end,
+    )
     counts["points"] += len(frame.points)
     counts["beams"] += frame.emitted
 
@@ -293,7 +305,9 @@ def _write_imu(writer: SessionWriter, imu: ImuRecord | None, sample: int, counts
     counts["imu"] += 1
 
 
-def _write_photo(writer: SessionWriter, rig: _Rig, stamp: int, photo: Future[bytes], counts: dict[str, int]) -> None:  # fmt: skip
+def _write_photo(
+    writer: SessionWriter, rig: _Rig, stamp: int, photo: Future[bytes], counts: dict[str, int]
+) -> None:
     assert rig.camera is not None
     received = stamp + 20_000_000  # exposure, readout and transfer
     writer.write_image(stamp, photo.result(), receive_ns=received)
@@ -302,7 +316,7 @@ def _write_photo(writer: SessionWriter, rig: _Rig, stamp: int, photo: Future[byt
 
 
 def _description(rig: _Rig) -> dict[str, str]:
-    return {"world": rig.world.name, "seed": str(rig.seed), "lidar": "avia", **_texts(rig.settings)}
+    return {"world": rig.world.name, "seed": str(rig.seed), "lidar": rig.pattern_name, **_texts(rig.settings)}
 
 
 def _texts(settings: Settings) -> dict[str, str]:
@@ -365,7 +379,9 @@ def _observed(rig: _Rig, blocks: range, store: HitStore) -> ObservedSurface:
     parts = []
     for k in blocks:
         scene = rig.window.at(float(rig.world.block_edges[k : k + 2].mean()))
-        parts.append(observed_surface(rig.world.build_block(k), scene, store, rig.settings.reference_spacing_m))  # fmt: skip
+        parts.append(
+            observed_surface(rig.world.build_block(k), scene, store, rig.settings.reference_spacing_m)
+        )
     return ObservedSurface(
         np.concatenate([p.points for p in parts]),
         np.concatenate([p.normals for p in parts]),
@@ -387,7 +403,7 @@ def _write_mesh(path: Path, mesh: WorldMesh, world: World, T_session_world: F64)
     labels = np.zeros(len(mesh.vertices), np.uint8)
     labels[mesh.triangles] = mesh.class_id[:, None]
     colours = np.zeros((len(mesh.vertices), 3), np.uint8)
-    luma = world.atlas.mean_luma[mesh.material][:, None] / 255.0
+    luma = world.atlas.arrays.mean_luma[mesh.material][:, None] / 255.0
     colours[mesh.triangles] = (mesh.tint * luma).astype(np.uint8)[:, None]
     write_ply(
         path,
@@ -407,7 +423,10 @@ _REFERENCE_POINT = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("lab
 def _write_reference(path: Path, surface: ObservedSurface, world: World, T_session_world: F64) -> None:
     comments = "".join(f"comment label {k} {name}\n" for k, name in _label_names(world).items())
     properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
-    header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {len(surface.points)}\n{properties}property uchar label\nend_header\n"  # fmt: skip
+    header = (
+        f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {len(surface.points)}\n"
+        f"{properties}property uchar label\nend_header\n"
+    )
     rows = np.empty(len(surface.points), _REFERENCE_POINT)
     rows["position"] = _moved(surface.points, T_session_world)
     rows["normal"] = surface.normals @ T_session_world[:3, :3].T
@@ -421,6 +440,7 @@ def _write_world_json(path: Path, rig: _Rig, frames: int, T_session_world: F64) 
     content = {
         "world": rig.world.name,
         "seed": rig.seed,
+        "lidar": rig.pattern_name,
         "seconds": frames * FRAME_NS / 1e9,
         "classes": _label_names(rig.world),
         "settings": msgspec.to_builtins(rig.settings),
@@ -429,6 +449,3 @@ def _write_world_json(path: Path, rig: _Rig, frames: int, T_session_world: F64) 
         "T_imu_lidar": T_IMU_LIDAR.tolist(),
     }
     write_bytes(path, (json.dumps(content, indent=1) + "\n").encode())
-
-
-__all__ = ["LIDARS", "WORLDS", "Settings", "SimulationSummary", "joined", "rasterise", "simulate"]

@@ -1,11 +1,11 @@
 """Scan pattern of the Livox Avia: a rosette of two counter-rotating prisms, six lasers, never repeating.
 
-Known of the Avia: field of view 70.4 x 77.2 degrees in non-repetitive mode, 240 000 points/s, six lasers fired
-in turn, frames of 100 ms (user manual; Livox SDK 1: line = point number modulo 6). Two equal prisms deflect a
-beam within a circle; we take its diameter as 70.4 degrees and spread the six lasers vertically over the
-missing 6.8 degrees. The prisms' rates are those published for the Mid-40 of the same maker (7294 and
--4664 rpm: Brazeal, Wilkinson & Hochmair, "A Rigorous Observation Model for the Risley Prism-Based Livox Mid-40
-Lidar Sensor", Sensors 21(14), 2021); the Avia's own are not published.
+Known of the Avia: field of view 70.4 x 77.2 degrees in non-repetitive mode, 240 000 points/s, six lasers
+fired in turn, frames of 100 ms (user manual; Livox SDK 1: line = point number modulo 6). Two equal prisms
+deflect a beam within a circle; we take its diameter as 70.4 degrees and spread the six lasers vertically over
+the missing 6.8 degrees. The prisms' rates are those published for the Mid-40 of the same maker, 7294 and
+-4664 rpm (Brazeal, Wilkinson & Hochmair, "A Rigorous Observation Model for the Risley Prism-Based Livox
+Mid-40 Lidar Sensor", Sensors 21(14), 2021); the Avia's own are not published.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Houses with relief: recessed windows and doors, sills, cornices, plinths, balconies, awnings, shop signs."""
+"""Houses with relief: recessed windows and doors, sills, cornices, balconies, awnings, shop signs."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +49,14 @@ class HouseStyle:
 def random_style(rng: Rng) -> HouseStyle:
     """A style drawn from ``rng``."""
     warm = np.array([1.0, 0.93, 0.82]) * rng.uniform(0.75, 1.0)
-    tints = [(0.86, 0.5, 0.4), (0.75, 0.62, 0.5), tuple(warm), (0.72, 0.8, 0.82), (0.95, 0.85, 0.55), (0.8, 0.62, 0.55)]  # fmt: skip
+    tints = [
+        (0.86, 0.5, 0.4),
+        (0.75, 0.62, 0.5),
+        tuple(warm),
+        (0.72, 0.8, 0.82),
+        (0.95, 0.85, 0.55),
+        (0.8, 0.62, 0.55),
+    ]
     tint = np.array(tints[rng.integers(len(tints))]) * rng.uniform(0.85, 1.1)
     base = np.array([1.0, 0.97, 0.92]) * rng.uniform(0.5, 0.85)
     return HouseStyle(
@@ -123,8 +131,8 @@ def _front(holes: list[Hole], width: float, z0: float, z1: float) -> Shape:
     inside = [z for h in holes for z in (h.z0, h.z1) if z0 < z < z1]
     zs = np.unique([z0, z1, *inside])
     cells = []
-    for xa, xb in zip(xs[:-1], xs[1:], strict=True):
-        for za, zb in zip(zs[:-1], zs[1:], strict=True):
+    for xa, xb in itertools.pairwise(xs):
+        for za, zb in itertools.pairwise(zs):
             x, z = (xa + xb) / 2, (za + zb) / 2
             if not any(h.x0 < x < h.x1 and h.z0 < z < h.z1 for h in holes):
                 cells.append([(xa, 0, za), (xb, 0, za), (xb, 0, zb), (xa, 0, zb)])
@@ -201,9 +209,7 @@ def _add_balcony(builder: MeshBuilder, T: F64, width: float) -> None:
     depth, high = 0.9, 1.0
     builder.add(box((0, -depth, -0.14), (width, 0.1, 0.0)), "concrete", (1, 1, 1), T)
     rails = [box((0, -depth, high - 0.05), (width, -depth + 0.05, high))]
-    rails += [
-        box((x, -depth, high - 0.05), (x + 0.05, 0.05, high - 0.005)) for x in (0.0, width - 0.05)
-    ]
+    rails += [box((x, -depth, high - 0.05), (x + 0.05, 0.05, high - 0.005)) for x in (0.0, width - 0.05)]
     for x in np.linspace(0.02, width - 0.05, max(int(width / 0.14), 2)):
         rails.append(box((x, -depth + 0.01, -0.02), (x + 0.025, -depth + 0.035, high - 0.02)))
     builder.add(merged(rails), "metal", (0.25, 0.25, 0.27), T)
@@ -232,15 +238,15 @@ def _add_trim(builder: MeshBuilder, style: HouseStyle, holes: list[Hole], T: F64
     builder.add(tube(pipe, (0.05, 0.05), 8), "metal", (0.6, 0.62, 0.62), T)
 
 
-def _add_roof(
-    builder: MeshBuilder, rng: Rng, style: HouseStyle, T: F64, width: float, depth: float
-) -> None:
+def _add_roof(builder: MeshBuilder, rng: Rng, style: HouseStyle, T: F64, width: float, depth: float) -> None:
     rise, out = rng.uniform(1.8, 3.2), 0.25
     top = style.height_m
     profile = [(-out, top - 0.05), (depth + out, top - 0.05), (depth / 2, top + rise)]
     gable = prism(profile, -width, 0.0)  # profile runs along x: turn it so that it runs along y
     tint = np.array([0.8, 0.42, 0.34]) if rng.random() < 0.6 else np.array([0.5, 0.5, 0.55])
-    builder.add(gable, ("roof", "plaster_a"), (tuple(tint.tolist()), style.wall_tint), T @ pose(yaw=np.pi / 2))  # fmt: skip
+    builder.add(
+        gable, ("roof", "plaster_a"), (tuple(tint.tolist()), style.wall_tint), T @ pose(yaw=np.pi / 2)
+    )
     x = rng.uniform(1.0, width - 1.6)
     chimney = box((x, depth * 0.3, top), (x + 0.6, depth * 0.3 + 0.6, top + rise + 0.5))
     builder.add(chimney, "brick_a", (0.8, 0.5, 0.42), T)
@@ -289,7 +295,9 @@ def add_gate_wall(builder: MeshBuilder, rng: Rng, T: F64, width: float) -> None:
     tint = (0.9, 0.7, 0.6)
     builder.add(face, "brick_b", tint, T)
     builder.add(body, "brick_b", tint, T)
-    builder.add(fitted_panel(1.2, 1.98, 0.05), ("door", "wood"), (0.5, 0.6, 0.5), T @ pose(gate.x0, 0.12, 0.02))  # fmt: skip
+    builder.add(
+        fitted_panel(1.2, 1.98, 0.05), ("door", "wood"), (0.5, 0.6, 0.5), T @ pose(gate.x0, 0.12, 0.02)
+    )
     builder.add(box((-0.01, -0.06, high), (width + 0.01, 0.36, high + 0.09)), "concrete", (0.9, 0.9, 0.9), T)
     for x in (0.15, width - 0.15):
         builder.add(cylinder(0.09, high + 0.05, high + 0.3, 8), "concrete", (1, 1, 1), T @ pose(x, 0.15))

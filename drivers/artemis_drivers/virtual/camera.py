@@ -1,4 +1,4 @@
-"""A global-shutter colour camera: pinhole with Brown-Conrady distortion, textured, lit, shadowed, noisy, JPEG.
+"""A global-shutter colour camera: pinhole with Brown-Conrady distortion, lit, shadowed, noisy, JPEG.
 
 Exposure is instantaneous here; stamps are those of the middle of the exposure.
 """
@@ -59,7 +59,9 @@ def distort(x: F64, y: F64, k: tuple[float, float, float, float, float]) -> tupl
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y  # fmt: skip
+    return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (
+        r2 + 2 * y * y
+    ) + 2 * p2 * x * y
 
 
 def undistort(xd: F64, yd: F64, k: tuple[float, float, float, float, float]) -> tuple[F64, F64]:
@@ -116,14 +118,12 @@ class VirtualCamera:
         ids, _ = self.rasterise(
             self._local,
             scene.mesh.triangles,
-            np.linalg.inv(T_local_cam),
+            np.asarray(np.linalg.inv(T_local_cam), np.float64),
             self.canvas_view,
             self.canvas_size,
             False,
         )
-        return shade_image(
-            scene, self._shadow, ids, self.lines, self.canvas, T_world_cam, 1.0 / self.spec.fx
-        )
+        return shade_image(scene, self._shadow, ids, self.lines, self.canvas, T_world_cam, 1.0 / self.spec.fx)
 
     def develop(self, light: F32, index: int) -> U8:
         """8-bit RGB of linear light, with the sensor's noise of image ``index``."""

@@ -13,9 +13,16 @@ from artemis_drivers.virtual.textures import PLATES
 
 Rng = np.random.Generator
 _PAINTS: tuple[Colour, ...] = (
-    (0.75, 0.08, 0.08), (0.12, 0.2, 0.5), (0.85, 0.85, 0.87), (0.12, 0.12, 0.13), (0.5, 0.52, 0.55),
-    (0.1, 0.35, 0.2), (0.85, 0.65, 0.1), (0.35, 0.2, 0.12), (0.6, 0.75, 0.85),
-)  # fmt: skip
+    (0.75, 0.08, 0.08),
+    (0.12, 0.2, 0.5),
+    (0.85, 0.85, 0.87),
+    (0.12, 0.12, 0.13),
+    (0.5, 0.52, 0.55),
+    (0.1, 0.35, 0.2),
+    (0.85, 0.65, 0.1),
+    (0.35, 0.2, 0.12),
+    (0.6, 0.75, 0.85),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +77,15 @@ def _body(kind: _Kind) -> Shape:
     rings = []
     for share, wide, low, shoulder, top in stations:
         w = wide * kind.width / 2
-        half = [(0.80 * w, low), (0.97 * w, low + 0.10), (w, shoulder - 0.12), (0.99 * w, shoulder), (0.90 * w, top), (0.5 * w, top + 0.025)]  # fmt: skip
+        side = shoulder - low
+        half = [
+            (0.80 * w, low),
+            (0.97 * w, low + 0.2 * side),
+            (w, low + 0.75 * side),
+            (0.99 * w, shoulder),
+            (0.90 * w, top),
+            (0.50 * w, top + 0.025),
+        ]
         ring = [(-y, z) for y, z in half[:1]] + half + [(-y, z) for y, z in half[:0:-1]]
         rings.append([(share * kind.length, y, z) for y, z in ring])
     return loft(np.array(rings, np.float64))
@@ -105,9 +120,24 @@ def _add_wheels(builder: MeshBuilder, kind: _Kind, T: F64) -> None:
     for x in (0.175 * kind.length, 0.815 * kind.length):
         for sign in (-1.0, 1.0):
             T_wheel = T @ pose(x, sign * (side - 0.11), radius, roll=np.pi / 2)
-            builder.add(cylinder(radius + 0.055, -0.10, 0.10, 20), "rubber", (0.08, 0.08, 0.08), T_wheel @ pose(z=-sign * 0.012))  # fmt: skip
-            builder.add(cylinder(radius, -0.11, 0.11, 20), "rubber", (0.16, 0.16, 0.17), T_wheel @ pose(z=-sign * 0.015))  # fmt: skip
-            builder.add(cylinder(radius * 0.62, -0.11, 0.11, 14), "metal", (0.75, 0.75, 0.78), T_wheel @ pose(z=-sign * 0.028))  # fmt: skip
+            builder.add(
+                cylinder(radius + 0.055, -0.10, 0.10, 20),
+                "rubber",
+                (0.08, 0.08, 0.08),
+                T_wheel @ pose(z=-sign * 0.012),
+            )
+            builder.add(
+                cylinder(radius, -0.11, 0.11, 20),
+                "rubber",
+                (0.16, 0.16, 0.17),
+                T_wheel @ pose(z=-sign * 0.015),
+            )
+            builder.add(
+                cylinder(radius * 0.62, -0.11, 0.11, 14),
+                "metal",
+                (0.75, 0.75, 0.78),
+                T_wheel @ pose(z=-sign * 0.028),
+            )
 
 
 def _add_details(builder: MeshBuilder, rng: Rng, kind: _Kind, paint: Colour, T: F64) -> None:

@@ -47,7 +47,9 @@ def add_tree(builder: MeshBuilder, rng: Rng, T: F64) -> None:
         tip = crown + radii * np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.1, 0.7)]) * 0.75
         start = trunk[3] - [0, 0, rng.uniform(0, 0.5)]
         middle = (start + tip) / 2 + [0, 0, 0.15]
-        builder.add(tube(np.array([start, middle, tip]), np.array([0.4, 0.25, 0.1]) * radius, 6), "bark", bark, T)  # fmt: skip
+        builder.add(
+            tube(np.array([start, middle, tip]), np.array([0.4, 0.25, 0.1]) * radius, 6), "bark", bark, T
+        )
     builder.add(_leaves(rng, crown, radii), "leaf", _leaf_tint(rng), T)
 
 
@@ -62,9 +64,11 @@ def _leaves(rng: Rng, crown: F64, radii: F64) -> Shape:
     bunches = rng.normal(0, 1, (18, 3))
     bunches *= (rng.uniform(0.35, 0.85, 18) / np.linalg.norm(bunches, axis=1))[:, None]
     offset = bunches[rng.integers(0, 18, count)] + rng.normal(0, 0.2, (count, 3))
-    normals = rng.normal(0, 1, (count, 3)) + [0, 0, 0.8]
+    normals = rng.normal(0, 1, (count, 3)) + np.array([0, 0, 0.8])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return leaf_cards(crown + offset * radii, normals, rng.uniform(0, 2 * np.pi, count), LEAF_LENGTH, LEAF_WIDTH)  # fmt: skip
+    return leaf_cards(
+        crown + offset * radii, normals, rng.uniform(0, 2 * np.pi, count), LEAF_LENGTH, LEAF_WIDTH
+    )
 
 
 def add_person(builder: MeshBuilder, rng: Rng, T: F64) -> None:
@@ -75,8 +79,12 @@ def add_person(builder: MeshBuilder, rng: Rng, T: F64) -> None:
     trousers, shirt, hair = _colour(rng, 0.1, 0.5), _colour(rng, 0.2, 1.0), _colour(rng, 0.08, 0.4)
     step = rng.uniform(0.05, 0.16)
     for side, forward in ((-0.095, step), (0.095, -step)):
-        builder.add(limb((forward, side, 0.07), (forward * 0.5, side, 0.48), 0.055, 0.07), "cloth", trousers, T)  # fmt: skip
-        builder.add(limb((forward * 0.5, side, 0.48), (0, side * 0.9, 0.88), 0.07, 0.095), "cloth", trousers, T)  # fmt: skip
+        builder.add(
+            limb((forward, side, 0.07), (forward * 0.5, side, 0.48), 0.055, 0.07), "cloth", trousers, T
+        )
+        builder.add(
+            limb((forward * 0.5, side, 0.48), (0, side * 0.9, 0.88), 0.07, 0.095), "cloth", trousers, T
+        )
         shoe = T @ pose(forward + 0.05, side, 0.045)
         builder.add(ellipsoid((0.14, 0.05, 0.065), 10, 6), "rubber", (0.2, 0.18, 0.17), shoe)
     builder.add(_torso(), "cloth", shirt, T)
@@ -92,7 +100,14 @@ def add_person(builder: MeshBuilder, rng: Rng, T: F64) -> None:
 
 
 def _torso() -> Shape:
-    sections = [(0.82, 0.10, 0.14), (0.90, 0.125, 0.175), (1.05, 0.11, 0.155), (1.25, 0.12, 0.18), (1.40, 0.10, 0.19), (1.47, 0.06, 0.10)]  # fmt: skip
+    sections = [
+        (0.82, 0.10, 0.14),
+        (0.90, 0.125, 0.175),
+        (1.05, 0.11, 0.155),
+        (1.25, 0.12, 0.18),
+        (1.40, 0.10, 0.19),
+        (1.47, 0.06, 0.10),
+    ]
     angle = 2 * np.pi * np.arange(14) / 14
     rings = [np.column_stack([a * np.cos(angle), b * np.sin(angle), np.full(14, z)]) for z, a, b in sections]
     return loft(np.array(rings))
@@ -123,7 +138,9 @@ def add_lamp(builder: MeshBuilder, rng: Rng, T: F64) -> None:
     builder.begin("pole")
     high = rng.uniform(5.5, 7.0)
     grey = _colour(rng, 0.28, 0.4)
-    path = np.array([[0, 0, -SUNK], [0, 0, high - 0.5], [0.12, 0, high - 0.12], [0.5, 0, high], [1.3, 0, high + 0.05]])  # fmt: skip
+    path = np.array(
+        [[0, 0, -SUNK], [0, 0, high - 0.5], [0.12, 0, high - 0.12], [0.5, 0, high], [1.3, 0, high + 0.05]]
+    )
     builder.add(tube(path, (0.085, 0.06, 0.05, 0.045, 0.04), 12), "metal", grey, T)
     builder.add(cylinder(0.12, -SUNK, 0.55, 12, 0.10), "metal", grey, T)
     builder.add(box((1.15, -0.12, high - 0.02), (1.85, 0.12, high + 0.1)), "metal", grey, T)
@@ -145,7 +162,12 @@ def add_road_sign(builder: MeshBuilder, rng: Rng, T: F64) -> None:
         shape = Shape(disc.vertices, disc.triangles, disc.uv * scale, disc.part)
         builder.add(shape, (f"road_sign_{kind}", "metal"), (1, 1, 1), T_face)
     else:
-        builder.add(fitted_panel(0.6, 0.6, 0.025), (f"road_sign_{kind}", "metal"), (1, 1, 1), T_face @ pose(-0.3, -0.0125, -0.3))  # fmt: skip
+        builder.add(
+            fitted_panel(0.6, 0.6, 0.025),
+            (f"road_sign_{kind}", "metal"),
+            (1, 1, 1),
+            T_face @ pose(-0.3, -0.0125, -0.3),
+        )
 
 
 def add_bin(builder: MeshBuilder, rng: Rng, T: F64) -> None:
@@ -163,7 +185,12 @@ def add_bin(builder: MeshBuilder, rng: Rng, T: F64) -> None:
     lid = box((-0.31, -0.31, 0), (0.33, 0.31, 0.06))
     builder.add(lid, "plastic", tint, T @ pose(0, 0, 0.95, pitch=0.1))
     for y in (-0.25, 0.25):
-        builder.add(cylinder(0.1, -0.03, 0.03, 12), "rubber", (0.15, 0.15, 0.15), T @ pose(-0.24, y, 0.1, roll=np.pi / 2))  # fmt: skip
+        builder.add(
+            cylinder(0.1, -0.03, 0.03, 12),
+            "rubber",
+            (0.15, 0.15, 0.15),
+            T @ pose(-0.24, y, 0.1, roll=np.pi / 2),
+        )
 
 
 def add_boxes(builder: MeshBuilder, rng: Rng, T: F64) -> None:
@@ -177,7 +204,9 @@ def add_boxes(builder: MeshBuilder, rng: Rng, T: F64) -> None:
         if rng.random() < 0.5:
             top = rng.uniform(0.2, 0.3)
             T_top = T_low @ pose(0, 0, h, yaw=rng.uniform(-0.6, 0.6))
-            builder.add(box((-top / 2, -top / 2, -0.01), (top / 2, top / 2, top)), "cardboard", (0.9, 0.95, 1), T_top)  # fmt: skip
+            builder.add(
+                box((-top / 2, -top / 2, -0.01), (top / 2, top / 2, top)), "cardboard", (0.9, 0.95, 1), T_top
+            )
         x += w / 2 + 0.4
 
 
@@ -196,5 +225,9 @@ def add_cabinet(builder: MeshBuilder, rng: Rng, T: F64) -> None:
     w, d, h = rng.uniform(0.7, 1.2), rng.uniform(0.32, 0.45), rng.uniform(0.95, 1.3)
     grey = _colour(rng, 0.55, 0.7)
     builder.add(box((-w / 2, -d / 2, -SUNK), (w / 2, d / 2, h)), "metal", grey, T)
-    builder.add(box((-w / 2 - 0.03, -d / 2 - 0.03, h), (w / 2 + 0.03, d / 2 + 0.03, h + 0.05)), "metal", grey, T)  # fmt: skip
-    builder.add(box((-0.01, -d / 2 - 0.012, 0.1), (0.01, -d / 2 + 0.05, h - 0.05)), "metal", (0.3, 0.3, 0.3), T)  # fmt: skip
+    builder.add(
+        box((-w / 2 - 0.03, -d / 2 - 0.03, h), (w / 2 + 0.03, d / 2 + 0.03, h + 0.05)), "metal", grey, T
+    )
+    builder.add(
+        box((-0.01, -d / 2 - 0.012, 0.1), (0.01, -d / 2 + 0.05, h - 0.05)), "metal", (0.3, 0.3, 0.3), T
+    )

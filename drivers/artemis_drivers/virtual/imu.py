@@ -30,13 +30,21 @@ class ImuSpec:
     def scaled(self, factor: float) -> ImuSpec:
         """All noise multiplied; 0 gives an ideal IMU."""
         s = factor
-        return ImuSpec(self.rate_hz, self.gyro_noise * s, self.accel_noise * s, self.gyro_walk * s, self.accel_walk * s, self.gyro_bias * s, self.accel_bias * s)  # fmt: skip
+        return ImuSpec(
+            self.rate_hz,
+            self.gyro_noise * s,
+            self.accel_noise * s,
+            self.gyro_walk * s,
+            self.accel_walk * s,
+            self.gyro_bias * s,
+            self.accel_bias * s,
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class ImuRecord:
-    """``time_s`` (n,), ``gyro`` rad/s and ``accel`` m/s2 (specific force) (n, 3) in the body's axes; the biases
-    that are in them, (n, 3) each, are truth.
+    """``time_s`` (n,), ``gyro`` rad/s and ``accel`` m/s2 (specific force) (n, 3) in the body's axes; the
+    biases that are in them, (n, 3) each, are truth.
     """
 
     time_s: F64
@@ -48,15 +56,21 @@ class ImuRecord:
 
 def measure(motion: Motion, spec: ImuSpec, seed: int, seconds: float) -> ImuRecord:
     """Samples at multiples of 1 / rate from 0 to ``seconds`` inclusive."""
-    time = np.arange(int(round(seconds * spec.rate_hz)) + 1) / spec.rate_hz
+    time = np.arange(round(seconds * spec.rate_hz) + 1) / spec.rate_hz
     gyro = motion.angular_velocity(time)
-    force = motion.acceleration(time) + [0.0, 0.0, GRAVITY]
+    force = motion.acceleration(time) + np.array([0.0, 0.0, GRAVITY])
     accel = np.einsum("nji,nj->ni", motion.pose(time)[:, :3, :3], force)
     rng = np.random.default_rng([seed, 31])
     step, root = np.sqrt(1 / spec.rate_hz), np.sqrt(spec.rate_hz)
     shape = gyro.shape
-    gyro_bias = rng.normal(0, 1, 3) * spec.gyro_bias + np.cumsum(rng.normal(0, 1, shape), axis=0) * spec.gyro_walk * step  # fmt: skip
-    accel_bias = rng.normal(0, 1, 3) * spec.accel_bias + np.cumsum(rng.normal(0, 1, shape), axis=0) * spec.accel_walk * step  # fmt: skip
+    gyro_bias = (
+        rng.normal(0, 1, 3) * spec.gyro_bias
+        + np.cumsum(rng.normal(0, 1, shape), axis=0) * spec.gyro_walk * step
+    )
+    accel_bias = (
+        rng.normal(0, 1, 3) * spec.accel_bias
+        + np.cumsum(rng.normal(0, 1, shape), axis=0) * spec.accel_walk * step
+    )
     gyro = gyro + gyro_bias + rng.normal(0, 1, shape) * spec.gyro_noise * root
     accel = accel + accel_bias + rng.normal(0, 1, shape) * spec.accel_noise * root
     return ImuRecord(time, gyro, accel, gyro_bias, accel_bias)

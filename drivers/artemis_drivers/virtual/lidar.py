@@ -5,8 +5,8 @@ What a sensor scans is a :class:`Pattern` (see ``avia.py``); the physics here is
 Sources. Range noise: Livox states a distance random error (1 sigma) below 2 cm at 20 m on 80 % reflectivity
 (HAP user manual, table 1.2.1, which also gives the 0.28 x 0.03 degree beam of that family); we take 2 cm at
 all ranges up to there. Angular noise: below 0.1 degree there; 0.05 degree for the Avia (its specification).
-Detection: 190 m at 10 % reflectivity (Avia specification, 100 klx), scaled by the link budget P ~ rho cos / r2.
-Growth of the noise with range and with the stretch of the pulse on slanted surfaces is our assumption.
+Detection: 190 m at 10 % reflectivity (Avia specification, 100 klx), scaled by the link budget P ~ rho cos /
+r2. Growth of the noise with range and with the stretch of the pulse on slanted surfaces is our assumption.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
 from artemis_drivers.virtual.motion import Motion
 from artemis_drivers.virtual.raycast import Hits, cast
-from artemis_drivers.virtual.scene import Scene
-from artemis_drivers.virtual.shading import I64, sample
+from artemis_drivers.virtual.scene import Scene, Surface
+from artemis_drivers.virtual.shading import sample
+from artemis_drivers.virtual.textures import TextureArrays
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +42,8 @@ class LidarSpec:
 
 @dataclass(frozen=True, slots=True)
 class Beams:
-    """``time_s`` float64 (n,) from the frame's start, ``direction`` float64 (n, 3) unit in the sensor's frame,
-    ``line`` uint8 (n,) laser.
+    """``time_s`` float64 (n,) from the frame's start, ``direction`` float64 (n, 3) unit in the sensor's
+    frame, ``line`` uint8 (n,) laser.
     """
 
     time_s: F64
@@ -74,15 +75,15 @@ class Frame:
 
 
 @njit
-def _reflectivity(triangle: I32, hit: F64, rows: F32, look: U8, texels: I32, start: I64, metres: F32, reflectivity: F32, mean_luma: F32, out: F64) -> None:  # fmt: skip
+def _reflectivity(triangle: I32, hit: F64, surface: Surface, textures: TextureArrays, out: F64) -> None:
     """Material's reflectivity, varied by the picture at the point (hits relative to the scene's origin)."""
     for i in range(len(triangle)):
-        row, m = rows[triangle[i]], look[triangle[i], 3]
+        row, m = surface.rows[triangle[i]], surface.look[triangle[i], 3]
         u = row[4] * hit[i, 0] + row[5] * hit[i, 1] + row[6] * hit[i, 2] + row[7]
         v = row[8] * hit[i, 0] + row[9] * hit[i, 1] + row[10] * hit[i, 2] + row[11]
-        r, g, b = sample(texels, start, metres, m, u, v, 3.0)
-        bright = 0.5 + 0.5 * (r + g + b) / (3.0 * max(mean_luma[m], 1.0))
-        out[i] = min(max(reflectivity[m] * bright, 0.01), 1.0)
+        r, g, b = sample(textures, m, u, v, 3.0)
+        bright = 0.5 + 0.5 * (r + g + b) / (3.0 * max(textures.mean_luma[m], 1.0))
+        out[i] = min(max(textures.reflectivity[m] * bright, 0.01), 1.0)
 
 
 def scan(
@@ -132,11 +133,13 @@ def range_sigma(spec: LidarSpec, distance: F64, cosine: F64) -> F64:
     return np.asarray(np.sqrt(base**2 * (1 + (distance / spec.noise_growth_m) ** 2) + stretch**2))
 
 
-def _surface_at(scene: Scene, hits: Hits, seen: NDArray[np.intp], hit: F64, direction: F64) -> tuple[F64, F64]:  # fmt: skip
-    triangle, s, a = hits.triangle[seen], scene.surface, scene.atlas
+def _surface_at(
+    scene: Scene, hits: Hits, seen: NDArray[np.intp], hit: F64, direction: F64
+) -> tuple[F64, F64]:
+    triangle, surface = hits.triangle[seen], scene.surface
     rho = np.empty(len(seen))
-    _reflectivity(triangle, hit - scene.origin, s.rows, s.look, a.texels, a.start, a.metres, a.reflectivity, a.mean_luma, rho)  # fmt: skip
-    cosine = np.abs((s.rows[triangle, :3] * direction[seen]).sum(axis=1))
+    _reflectivity(triangle, hit - scene.origin, surface, scene.atlas.arrays, rho)
+    cosine = np.abs((surface.rows[triangle, :3] * direction[seen]).sum(axis=1))
     return rho, cosine
 
 

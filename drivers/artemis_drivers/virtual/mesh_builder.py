@@ -24,16 +24,25 @@ Colour = tuple[float, float, float]
 
 #: Class names of all virtual worlds; the index is the label. 0 means "nothing of the others".
 CLASS_NAMES = (
-    "background", "ground", "building", "car", "person", "bench", "tree", "pole", "sign", "other",
-)  # fmt: skip
+    "background",
+    "ground",
+    "building",
+    "car",
+    "person",
+    "bench",
+    "tree",
+    "pole",
+    "sign",
+    "other",
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
     """Triangles in a shape's own frame, metres.
 
-    ``vertices`` float64 (n, 3); ``triangles`` int32 (m, 3); ``uv`` float64 (m, 3, 2) texture coordinates of the
-    corners in metres on the surface; ``part`` int32 (m,) chooses among the materials given to
+    ``vertices`` float64 (n, 3); ``triangles`` int32 (m, 3); ``uv`` float64 (m, 3, 2) texture coordinates of
+    the corners in metres on the surface; ``part`` int32 (m,) chooses among the materials given to
     :meth:`MeshBuilder.add`.
     """
 
@@ -52,8 +61,8 @@ class Shape:
 class WorldMesh:
     """Triangles of a world or of a part of it.
 
-    ``vertices`` float32 (n, 3) metres, z up; ``triangles`` int32 (m, 3); per triangle: ``uv`` float32 (m, 3, 2)
-    metres, ``material`` uint16, ``tint`` uint8 (m, 3) multiplies the texture, ``class_id`` uint8 index of
+    ``vertices`` float32 (n, 3) metres, z up; ``triangles`` int32 (m, 3); per triangle: ``uv`` float32 (m, 3,
+    2) metres, ``material`` uint16, ``tint`` uint8 (m, 3) multiplies the texture, ``class_id`` uint8 index of
     CLASS_NAMES, ``instance`` int32 unique in the world.
     """
 
@@ -100,8 +109,13 @@ class MeshBuilder:
         self._class_id = 0
         self._vertices: list[F64] = []
         self._columns: dict[str, list[Any]] = {
-            "triangles": [], "uv": [], "material": [], "tint": [], "class_id": [], "instance": [],
-        }  # fmt: skip
+            "triangles": [],
+            "uv": [],
+            "material": [],
+            "tint": [],
+            "class_id": [],
+            "instance": [],
+        }
         self._vertex_count = 0
 
     def begin(self, class_name: str) -> int:

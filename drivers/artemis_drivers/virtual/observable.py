@@ -1,14 +1,16 @@
 """What a LiDAR observed of a world: the reference that a map of it can fairly be judged by.
 
-A point of a surface counts as observed when a beam met the same object within REACH_M of it, the surface faces
-the place that beam came from, and the line from there to the point is free: a beam aimed at it would have
-returned. So the far side of things, what others hide, and what lies between two beams further apart than twice
-the reach are not asked for, whatever the mapping did with the points.
+A point of a surface counts as observed when a beam met the same object within REACH_M of it, the surface
+faces the place that beam came from, and the line from there to the point is free: a beam aimed at it would
+have returned. So the far side of things, what others hide, and what lies between two beams further apart than
+twice the reach are not asked for, whatever the mapping did with the points.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +65,9 @@ class HitStore:
         parts = [(self.hit, self.origin, self.instance), *self._pending]
         hit, origin, instance = (np.concatenate(column) for column in zip(*parts, strict=True))
         cube = np.floor(hit / _THIN_M).astype(np.int64)
-        key = ((instance.astype(np.int64) * 73856093) ^ (cube[:, 0] * 19349663 + cube[:, 1]) * 83492791) + cube[:, 2]  # fmt: skip
+        key = (
+            (instance.astype(np.int64) * 73856093) ^ (cube[:, 0] * 19349663 + cube[:, 1]) * 83492791
+        ) + cube[:, 2]
         nearest = np.lexsort((((hit - origin) ** 2).sum(axis=1), key))
         first = np.ones(len(key), bool)
         first[1:] = key[nearest[1:]] != key[nearest[:-1]]
@@ -100,9 +104,10 @@ def observed_surface(mesh: WorldMesh, scene: Scene, store: HitStore, spacing_m: 
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Beams:
-    """Beams sorted by cell: ``table`` hash set of the cells, ``start`` (slots, 2) rows of a cell's beams;
+class _Beams(NamedTuple):
+    """Beams sorted by cell, as kernels take them.
+
+    ``table`` hash set of the cells, ``start`` (slots, 2) rows of a cell's beams;
     ``coarse`` hash set of the larger cells that have a beam in or beside them. Positions are local.
     """
 
@@ -125,7 +130,7 @@ def _portions(corners: F64, spacing_m: float) -> list[slice]:
     ends = np.cumsum(_points_at_most(corners, spacing_m))
     cuts = np.searchsorted(ends, np.arange(_PORTION, ends[-1] if len(ends) else 0, _PORTION)) + 1
     edges = np.unique([0, *cuts.tolist(), len(corners)])
-    return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
 
 def _points_at_most(corners: F64, spacing_m: float) -> F64:
@@ -144,7 +149,7 @@ def _observed_part(
     room = int(_points_at_most(corners, spacing_m).sum())
     points, triangle = np.empty((room, 3)), np.empty(room, np.int64)
     tries = np.empty((room, _TRIES), np.int32)
-    count = _sample(corners, normals, instance, spacing_m, beams.table, beams.start, beams.hit, beams.origin, beams.instance, beams.coarse, points, triangle, tries)  # fmt: skip
+    count = _sample(corners, normals, instance, spacing_m, beams, points, triangle, tries)
     points, triangle, tries = points[:count], triangle[:count], tries[:count]
     seen = first_free_line(scene.bvh, points, beams.origin, tries, _SLACK_M) >= 0
     return points[seen], triangle[seen]
@@ -153,7 +158,9 @@ def _observed_part(
 def _pack(cell: I64) -> I64:
     """One non-negative number of a cell (n, 3); 21 bits an axis."""
     half = 1 << 20
-    return np.asarray(((cell[:, 0] + half) << 42) | ((cell[:, 1] + half) << 21) | (cell[:, 2] + half), np.int64)  # fmt: skip
+    return np.asarray(
+        ((cell[:, 0] + half) << 42) | ((cell[:, 1] + half) << 21) | (cell[:, 2] + half), np.int64
+    )
 
 
 def _dilated(cell: I64) -> I64:
@@ -212,8 +219,9 @@ def _key(x: float, y: float, z: float, cell: float) -> int:
 
 
 @njit
-def _beams_near(p: F64, normal: F64, instance: int, table: I64, start: I64, hit: F64, origin: F64, owner: I32, beams: I32) -> int:  # fmt: skip
-    """Up to len(beams) beams that met the object within reach of ``p`` and came from the front of it."""
+def _beams_near(p: F64, normal: F64, instance: int, beams: _Beams, near: I32) -> int:
+    """Up to len(near) beams that met the object within reach of ``p`` and came from the front of it."""
+    table, start, hit, origin = beams.table, beams.start, beams.hit, beams.origin
     found = 0
     # cells are twice the reach wide: a sphere of that radius touches two of them along each axis at most
     sx = _CELL_M / 2 if p[0] / _CELL_M - np.floor(p[0] / _CELL_M) >= 0.5 else -_CELL_M / 2
@@ -225,26 +233,33 @@ def _beams_near(p: F64, normal: F64, instance: int, table: I64, start: I64, hit:
         if table[slot] != key:
             continue
         for k in range(start[slot, 0], start[slot, 1]):
-            if owner[k] != instance:
+            if beams.instance[k] != instance:
                 continue
             d2 = (hit[k, 0] - p[0]) ** 2 + (hit[k, 1] - p[1]) ** 2 + (hit[k, 2] - p[2]) ** 2
             front = 0.0
             for a in range(3):
                 front += normal[a] * (origin[k, a] - p[a])
             if d2 <= REACH_M * REACH_M and front > 0:
-                beams[found] = k
+                near[found] = k
                 found += 1
-                if found == len(beams):
+                if found == len(near):
                     return found
     return found
 
 
 @njit
 def _sample(
-    corners: F64, normals: F64, triangle_instance: I32, spacing: float, table: I64, start: I64, hit: F64, origin: F64, owner: I32, coarse: I64,
-    points: F64, triangle: I64, tries: I32,
-) -> int:  # fmt: skip
+    corners: F64,
+    normals: F64,
+    instance: I32,
+    spacing: float,
+    beams: _Beams,
+    points: F64,
+    triangle: I64,
+    tries: I32,
+) -> int:
     """Rows of points on every triangle; keeps those with beams near, returns their number."""
+    coarse = beams.coarse
     count = 0
     p = np.empty(3)
     for t in range(len(corners)):
@@ -271,7 +286,7 @@ def _sample(
                     continue
                 near = tries[count]
                 near[:] = -1
-                if _beams_near(p, normals[t], triangle_instance[t], table, start, hit, origin, owner, near):
+                if _beams_near(p, normals[t], instance[t], beams, near):
                     points[count], triangle[count] = p, t
                     count += 1
                 k += 1

@@ -10,6 +10,7 @@ Moeller & Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32
 
-Vector = tuple[float, float, float]
+Vector = tuple[Any, Any, Any]  # float32 scalars of a kernel
 _LEAF = 4  # triangles in a leaf at most
 _BINS = 16
 _STACK = 96
@@ -26,11 +27,13 @@ _SLACK = np.float32(1.0000004)
 _F0, _F1, _FINF = np.float32(0), np.float32(1), np.float32(np.inf)
 
 
-@dataclass(frozen=True, slots=True)
-class Bvh:
-    """``origin`` float64 (3,) of the local frame; ``boxes`` float32 (n, 12) low and high corners of both children;
-    ``child`` int32 (n, 2) an inner node, or the complement of first * 8 + count of a leaf; ``corner`` float32 (m, 9)
-    first corner and two edges of the triangles in order of the leaves; ``order`` int32 (m,) their numbers in the mesh.
+class Bvh(NamedTuple):
+    """The hierarchy, as kernels take it.
+
+    ``origin`` float64 (3,) of the local frame; ``boxes`` float32 (n, 12) low and high corners of both
+    children; ``child`` int32 (n, 2) an inner node, or the complement of first * 8 + count of a leaf;
+    ``corner`` float32 (m, 9) first corner and two edges of the triangles in order of the leaves; ``order``
+    int32 (m,) their numbers in the mesh.
     """
 
     origin: F64
@@ -78,25 +81,26 @@ def cast(bvh: Bvh, origins: F64, directions: F64, max_m: F64 | float = np.inf) -
     local = (origins - bvh.origin).astype(np.float32)
     limit = np.broadcast_to(np.asarray(max_m, np.float32), (n,))
     if len(bvh.order) == 0:
-        return Hits(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n, np.float32), np.zeros(n, np.float32))  # fmt: skip
-    _cast(bvh.boxes, bvh.child, bvh.corner, bvh.order, local, directions.astype(np.float32), limit, distance, triangle, u, v)  # fmt: skip
+        distance[:], triangle[:], u[:], v[:] = np.inf, -1, 0, 0
+    else:
+        _cast(bvh, local, directions.astype(np.float32), limit, distance, triangle, u, v)
     return Hits(distance, triangle, u, v)
 
 
 def first_free_line(bvh: Bvh, points: F64, eyes: F64, tries: I32, slack_m: float) -> I32:
     """Per point the first of its eyes from which nothing blocks the view, -1 when all are blocked.
 
-    ``points`` (n, 3) and ``eyes`` (e, 3) are relative to ``bvh.origin``; ``tries`` int32 (n, k) numbers of eyes,
+    ``points`` (n, 3) and ``eyes`` (e, 3) are relative to ``bvh.origin``; ``tries`` int32 (n, k) eye numbers,
     -1 for none. What lies within ``slack_m`` before the point does not block.
     """
     out = np.empty(len(points), np.int32)
-    _first_free_line(bvh.boxes, bvh.child, bvh.corner, points, eyes, tries, slack_m, out)
+    _first_free_line(bvh, points, eyes, tries, slack_m, out)
     return out
 
 
 @njit
 def _area(low: F32, high: F32) -> float:
-    dx, dy, dz = high[0] - low[0], high[1] - low[1], high[2] - low[2]
+    dx, dy, dz = float(high[0] - low[0]), float(high[1] - low[1]), float(high[2] - low[2])
     return dx * dy + dy * dz + dz * dx
 
 
@@ -151,8 +155,18 @@ def _best_split(low: F32, high: F32, order: I32, start: int, stop: int) -> tuple
 
 @njit
 def _fill_bins(
-    low: F32, high: F32, order: I32, start: int, stop: int, axis: int, first: float, scale: float, b_lo: F32, b_hi: F32, count: NDArray[np.int64]
-) -> None:  # fmt: skip
+    low: F32,
+    high: F32,
+    order: I32,
+    start: int,
+    stop: int,
+    axis: int,
+    first: float,
+    scale: float,
+    b_lo: F32,
+    b_hi: F32,
+    count: NDArray[np.int64],
+) -> None:
     b_lo[:] = _FINF
     b_hi[:] = -_FINF
     count[:] = 0
@@ -179,7 +193,7 @@ def _partition(low: F32, high: F32, order: I32, start: int, stop: int) -> int:
                 end -= 1
                 order[k], order[end] = order[end], order[k]
         middle = k
-    if middle == start or middle == stop:
+    if middle in (start, stop):
         middle = (start + stop) // 2
     return middle
 
@@ -218,7 +232,7 @@ def _build(low: F32, high: F32, order: I32) -> tuple[F32, I32, int]:
 
 
 @njit
-def _enter(b: F32, first: int, o: Vector, inv: Vector, limit: float) -> float:
+def _enter(b: F32, first: int, o: Vector, inv: Vector, limit: Any) -> Any:
     """Distance at which the ray enters a child's box, inf when it misses."""
     x0, x1 = (b[first] - o[0]) * inv[0], (b[first + 3] - o[0]) * inv[0]
     y0, y1 = (b[first + 1] - o[1]) * inv[1], (b[first + 4] - o[1]) * inv[1]
@@ -230,15 +244,23 @@ def _enter(b: F32, first: int, o: Vector, inv: Vector, limit: float) -> float:
 
 
 @njit
-def _inverse(d: float) -> float:
+def _inverse(d: Any) -> Any:
     """1 / d, bounded: with an infinity the box test would compute 0 * inf."""
     return _F1 / d if abs(d) > np.float32(1e-12) else np.float32(1e12)
 
 
 @njit
 def _cast(
-    boxes: F32, child: I32, corner: F32, order: I32, origin: F32, direction: F32, limit: F32, distance: F64, triangle: I32, out_u: F32, out_v: F32
-) -> None:  # fmt: skip
+    bvh: Bvh,
+    origin: F32,
+    direction: F32,
+    limit: F32,
+    distance: F64,
+    triangle: I32,
+    out_u: F32,
+    out_v: F32,
+) -> None:
+    boxes, child, corner, order = bvh.boxes, bvh.child, bvh.corner, bvh.order
     stack = np.empty(_STACK, np.int32)
     entry = np.empty(_STACK, np.float32)
     for r in range(len(origin)):
@@ -277,9 +299,7 @@ def _cast(
 
 
 @njit
-def _first_free_line(
-    boxes: F32, child: I32, corner: F32, points: F64, eyes: F64, tries: I32, slack: float, out: I32
-) -> None:
+def _first_free_line(bvh: Bvh, points: F64, eyes: F64, tries: I32, slack: float, out: I32) -> None:
     stack = np.empty(_STACK, np.int32)
     for i in range(len(points)):
         out[i] = -1
@@ -292,16 +312,15 @@ def _first_free_line(
             o = (np.float32(eyes[eye, 0]), np.float32(eyes[eye, 1]), np.float32(eyes[eye, 2]))
             d = (np.float32(dx / length), np.float32(dy / length), np.float32(dz / length))
             inv = (_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
-            if not _blocked(boxes, child, corner, o, d, inv, np.float32(length - slack), stack):
+            if not _blocked(bvh, o, d, inv, np.float32(length - slack), stack):
                 out[i] = k
                 break
 
 
 @njit
-def _blocked(
-    boxes: F32, child: I32, corner: F32, o: Vector, d: Vector, inv: Vector, limit: float, stack: I32
-) -> bool:
+def _blocked(bvh: Bvh, o: Vector, d: Vector, inv: Vector, limit: float, stack: I32) -> bool:
     """Whether any triangle lies nearer than ``limit`` along the ray."""
+    boxes, child, corner = bvh.boxes, bvh.child, bvh.corner
     depth = 1
     stack[0] = 0
     while depth > 0:
@@ -328,8 +347,8 @@ def _blocked(
 
 
 @njit
-def _meet(c: F32, o: Vector, d: Vector) -> tuple[float, float, float]:
-    """Distance and barycentric u, v where the ray meets the triangle ``c`` of Bvh.corner; inf when it does not."""
+def _meet(c: F32, o: Vector, d: Vector) -> Vector:
+    """Distance and barycentric u, v where the ray meets a row of Bvh.corner; inf when it does not."""
     px = d[1] * c[8] - d[2] * c[7]
     py = d[2] * c[6] - d[0] * c[8]
     pz = d[0] * c[7] - d[1] * c[6]

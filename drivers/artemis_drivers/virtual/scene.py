@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,13 @@ from artemis_drivers.virtual.textures import SIZE, TextureAtlas
 from artemis_drivers.virtual.world import World
 
 
-@dataclass(frozen=True, slots=True)
-class Surface:
+class Surface(NamedTuple):
     """What shading needs of each triangle, packed into few cache lines, relative to ``Scene.origin``.
 
-    ``rows`` float32 (m, 16): 0-3 unit normal n and n.p of its points; 4-7 and 8-11 texture u and v in metres as
-    affine functions of p; 12 texels per metre of the picture on this triangle; 13-14 metres added to the
-    coordinates of the slow macro picture. ``look`` uint8 (m, 4): tint and material. ``key`` uint32 (m,): equal
-    for triangles of one plane that continue each other's texture.
+    ``rows`` float32 (m, 16): 0-3 unit normal n and n.p of its points; 4-7 and 8-11 texture u and v in metres
+    as affine functions of p; 12 texels per metre of the picture on this triangle; 13-14 metres added to the
+    coordinates of the slow macro picture. ``look`` uint8 (m, 4): tint and material. ``key`` uint32 (m,):
+    equal for triangles of one plane that continue each other's texture.
     """
 
     rows: F32
@@ -66,7 +66,7 @@ def _surface(mesh: WorldMesh, atlas: TextureAtlas, origin: F64) -> Surface:
         rows[:, 4 + 4 * k : 7 + 4 * k] = gradient
         rows[:, 7 + 4 * k] = texture[:, 0, k] - (gradient * a).sum(axis=1)
     stretch = np.sqrt(np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]) / np.sqrt(squared[:, 0]))
-    rows[:, 12] = stretch * SIZE / atlas.metres[mesh.material]
+    rows[:, 12] = stretch * SIZE / atlas.arrays.metres[mesh.material]
     rows[:, 13:15] = (mesh.instance[:, None].astype(np.int64) * [7919, 104729]) % 1009 / 1009.0 * 11.3
     look = np.column_stack([mesh.tint, mesh.material.astype(np.uint8)])
     return Surface(rows, look, _continuation_key(rows, look, mesh.instance))
@@ -96,7 +96,9 @@ class Window:
         """Scene around ``x``; the same object as long as the same blocks are in reach."""
         wanted = self.world.blocks_near(x, self.reach_m)
         if self._scene is None or wanted != self._shown:
-            self._blocks = {k: self._blocks[k] if k in self._blocks else self.world.build_block(k) for k in wanted}  # fmt: skip
+            self._blocks = {
+                k: self._blocks[k] if k in self._blocks else self.world.build_block(k) for k in wanted
+            }
             self._scene = prepare(joined([self._blocks[k] for k in wanted]), self.world.atlas)
             self._shown = wanted
         return self._scene

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
-from artemis_drivers.virtual.scene import Scene
-from artemis_drivers.virtual.textures import LEVELS, MACRO, MACRO_M, SIZE
+from artemis_drivers.virtual.scene import Scene, Surface
+from artemis_drivers.virtual.textures import LEVELS, MACRO, MACRO_M, SIZE, TextureArrays
 
-U32 = NDArray[np.uint32]
 I64 = NDArray[np.int64]
-Vector = tuple[float, float, float]
+Vector = tuple[Any, Any, Any]  # scalars of a kernel
 
 #: Draws triangles: (vertices float32 (n, 3), triangles, T_view_world, (fx, fy, cx, cy), (width, height),
 #: orthographic) -> (number of the triangle per pixel, -1 where none; nearness per pixel: 1/z, or -z when
@@ -31,9 +30,10 @@ _SKY = (0.42, 0.47, 0.56)
 _MACRO_MEAN = 217.0  # of 0..255, so that the slow picture keeps the mean brightness
 
 
-@dataclass(frozen=True, slots=True)
-class ShadowMap:
-    """``depth`` float32 (h, w) metres along the sun's rays, inf where nothing; ``rows`` float32 (3, 4) maps
+class ShadowMap(NamedTuple):
+    """What the sun reaches.
+
+    ``depth`` float32 (h, w) metres along the sun's rays, inf where nothing; ``rows`` float32 (3, 4) maps
     local coordinates to column, row and depth; ``sun`` float32 (3,) towards the sun.
     """
 
@@ -64,7 +64,7 @@ def shadow_map(scene: Scene, sun: F64, rasterise: Rasteriser) -> ShadowMap:
 
 
 @njit
-def _bilinear(texels: I32, first: int, size: int, u: float, v: float) -> tuple[float, float, float]:
+def _bilinear(texels: I32, first: int, size: int, u: float, v: float) -> Vector:
     """Colour 0..255 at picture coordinates u, v (1 = one repetition, v upwards)."""
     x, y = u * size - 0.5, (1.0 - v) * size - 0.5
     x0, y0 = int(np.floor(x)), int(np.floor(y))
@@ -92,30 +92,30 @@ def _bilinear_red(texels: I32, first: int, size: int, u: float, v: float) -> flo
     upper, lower = first + (y0 & mask) * size, first + ((y0 + 1) & mask) * size
     high = (1 - fx) * (texels[upper + left] & 255) + fx * (texels[upper + right] & 255)
     low = (1 - fx) * (texels[lower + left] & 255) + fx * (texels[lower + right] & 255)
-    return (1 - fy) * high + fy * low
+    return float((1 - fy) * high + fy * low)
 
 
 @njit
-def sample(
-    texels: I32, start: I64, metres: F32, m: int, u: float, v: float, lod: float
-) -> tuple[float, float, float]:
+def sample(textures: TextureArrays, m: int, u: float, v: float, lod: float) -> Vector:
     """Colour 0..255 of material ``m`` at u, v metres; ``lod`` is log2 of the pixel's width in texels."""
     lod = min(max(lod, 0.0), LEVELS - 1.001)
     level = int(lod)
     share = lod - level
-    u, v = u / metres[m], v / metres[m]
+    texels, start = textures.texels, textures.start
+    u, v = u / textures.metres[m], v / textures.metres[m]
     a = _bilinear(texels, start[m, level], SIZE >> level, u, v)
     if share < 0.05:
-        return a
+        return a[0], a[1], a[2]
     b = _bilinear(texels, start[m, level + 1], SIZE >> (level + 1), u, v)
     return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2])
 
 
 @njit
-def sample_slow(texels: I32, start: I64, u: float, v: float, lod: float) -> float:
+def sample_slow(textures: TextureArrays, u: float, v: float, lod: float) -> float:
     """Brightness 0..255 of the slow grey picture at u, v metres."""
     level = int(min(max(lod, 0.0), LEVELS - 1.001))
-    return _bilinear_red(texels, start[MACRO, level], SIZE >> level, u / MACRO_M, v / MACRO_M)
+    first, size = textures.start[MACRO, level], SIZE >> level
+    return float(_bilinear_red(textures.texels, first, size, u / MACRO_M, v / MACRO_M))
 
 
 @njit
@@ -141,13 +141,13 @@ def _sunlit(depth: F32, rows: F32, x: float, y: float, z: float) -> float:
 
 
 @njit
-def sky_colour(texels: I32, start: I64, d: Vector) -> Vector:
+def sky_colour(textures: TextureArrays, d: Vector) -> Vector:
     """Linear light of the sky in a direction: haze at the horizon, blue above, clouds."""
     up = max(d[2], 0.0)
     cloud = 0.0
     if d[2] > 0.03:
         s = 1.5 / d[2]
-        cloud = sample_slow(texels, start, d[0] * s, d[1] * s, 1.0)
+        cloud = sample_slow(textures, d[0] * s, d[1] * s, 1.0)
         cloud = min(max((cloud - 195.0) / 45.0, 0.0), 1.0) * min(d[2] * 4.0, 1.0)
     haze = np.exp(-4.0 * up)
     r, g, b = 0.22 + 0.45 * haze, 0.40 + 0.32 * haze, 0.75 + 0.05 * haze
@@ -155,19 +155,21 @@ def sky_colour(texels: I32, start: I64, d: Vector) -> Vector:
 
 
 @njit
-def _mirrored(texels: I32, start: I64, row: F32, d: Vector, facing: float, gloss: float) -> tuple[float, Vector]:  # fmt: skip
+def _mirrored(
+    textures: TextureArrays, row: F32, d: Vector, facing: float, gloss: float
+) -> tuple[float, Vector]:
     """Share and light of what a glossy surface mirrors: the sky, or a dark street below the horizon."""
     share = gloss + (1.0 - gloss) * (1.0 + max(facing, -1.0)) ** 5  # Schlick 1994
     e = -2.0 * facing
     q = (d[0] + e * row[0], d[1] + e * row[1], d[2] + e * row[2])
-    light = sky_colour(texels, start, q) if q[2] > 0.0 else (0.10, 0.10, 0.10)
+    light = sky_colour(textures, q) if q[2] > 0.0 else (0.10, 0.10, 0.10)
     return min(share, 0.5), light
 
 
 @njit
 def shade(
-    row: F32, look: U8, o: F64, d: Vector, pixel: float, texels: I32, start: I64, metres: F32, gloss: F32, shadow: F32, shadow_rows: F32, sun: F32
-) -> Vector:  # fmt: skip
+    row: F32, look: U8, o: F64, d: Vector, pixel: float, textures: TextureArrays, shadow: ShadowMap
+) -> Vector:
     """Linear light 0..~1.5 from the triangle of ``row`` and ``look`` (see Surface) along the ray o + s d.
 
     ``pixel`` is the width of the pixel in radians.
@@ -180,20 +182,22 @@ def shade(
     # width of the pixel on the surface: between its short and its long axis
     width = s * pixel / np.sqrt(max(-facing, 0.02))
     m = look[3]
-    r, g, b = sample(texels, start, metres, m, u, v, np.log2(max(width * row[12], 1e-6)))
+    r, g, b = sample(textures, m, u, v, np.log2(max(width * row[12], 1e-6)))
     slow_lod = 0.0 if width < MACRO_M / SIZE else np.log2(width * (SIZE / MACRO_M))
-    slow = sample_slow(texels, start, u + row[13], v + row[14], slow_lod)
+    slow = sample_slow(textures, u + row[13], v + row[14], slow_lod)
     k = slow / (_MACRO_MEAN * 255.0 * 255.0)
     r, g, b = r * k * look[0], g * k * look[1], b * k * look[2]
+    sun = shadow.sun
     direct = max(row[0] * sun[0] + row[1] * sun[1] + row[2] * sun[2], 0.0)
     if direct > 0.0:
-        direct *= _sunlit(shadow, shadow_rows, x, y, z)
+        direct *= _sunlit(shadow.depth, shadow.rows, x, y, z)
     sky = 0.62 + 0.38 * row[2]
     r *= r * (_SUN[0] * direct + _SKY[0] * sky)
     g *= g * (_SUN[1] * direct + _SKY[1] * sky)
     b *= b * (_SUN[2] * direct + _SKY[2] * sky)
-    if gloss[m] > 0.0:
-        share, q = _mirrored(texels, start, row, d, facing, gloss[m])
+    gloss = textures.gloss[m]
+    if gloss > 0.0:
+        share, q = _mirrored(textures, row, d, facing, gloss)
         r, g, b = r + share * (q[0] - r), g + share * (q[1] - g), b + share * (q[2] - b)
     return r, g, b
 
@@ -211,9 +215,19 @@ def _direction(R: F64, x: float, y: float) -> Vector:
 
 @njit
 def _pixels(
-    ids: I32, lines: F32, canvas: I32, R: F64, o: F64, pixel: float, rows: F32, look: U8, key: U32, texels: I32, start: I64, metres: F32, gloss: F32, shadow: F32, shadow_rows: F32, sun: F32, out: F32
-) -> None:  # fmt: skip
+    ids: I32,
+    lines: F32,
+    canvas: I32,
+    R: F64,
+    o: F64,
+    pixel: float,
+    surface: Surface,
+    textures: TextureArrays,
+    shadow: ShadowMap,
+    out: F32,
+) -> None:
     """Mean light of four sub-pixels; one shading where all four see the same surface."""
+    rows, look, key = surface.rows, surface.look, surface.key
     for i in range(len(canvas)):
         first = ids[canvas[i, 0]]
         same = True
@@ -227,10 +241,10 @@ def _pixels(
             d = _direction(R, lines[i, j, 0], lines[i, j, 1])
             t = ids[canvas[i, k]]
             if t < 0:
-                c = sky_colour(texels, start, d)
+                c = sky_colour(textures, d)
             else:
                 width = pixel if same else 0.5 * pixel
-                c = shade(rows[t], look[t], o, d, width, texels, start, metres, gloss, shadow, shadow_rows, sun)  # fmt: skip
+                c = shade(rows[t], look[t], o, d, width, textures, shadow)
             r, g, b = r + c[0], g + c[1], b + c[2]
         out[i, 0], out[i, 1], out[i, 2] = r / count, g / count, b / count
 
@@ -244,10 +258,20 @@ def shade_image(
     sub-pixels; ``lines`` float32 (h, w, 5, 2) their lines of sight x/z, y/z, the fifth that of the pixel's
     middle; ``pixel`` its width in radians.
     """
-    s, a = scene.surface, scene.atlas
     height, width = canvas.shape[:2]
     out = np.empty((height * width, 3), np.float32)
     o = T_world_cam[:3, 3] - scene.origin
     R = np.ascontiguousarray(T_world_cam[:3, :3])
-    _pixels(ids.reshape(-1), lines.reshape(-1, 5, 2), canvas.reshape(-1, 4), R, o, pixel, s.rows, s.look, s.key, a.texels, a.start, a.metres, a.gloss, shadow.depth, shadow.rows, shadow.sun, out)  # fmt: skip
+    _pixels(
+        ids.reshape(-1),
+        lines.reshape(-1, 5, 2),
+        canvas.reshape(-1, 4),
+        R,
+        o,
+        pixel,
+        scene.surface,
+        scene.atlas.arrays,
+        shadow,
+        out,
+    )
     return out.reshape(height, width, 3)

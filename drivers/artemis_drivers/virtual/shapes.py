@@ -11,6 +11,8 @@ import numpy as np
 
 from artemis_drivers.virtual.mesh_builder import F64, I32, Shape
 
+Numbers = Sequence[float] | F64
+
 
 def pose(
     x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0
@@ -29,7 +31,7 @@ def pose(
 
 
 def planar_uv(vertices: F64, triangles: I32) -> F64:
-    """Texture coordinates (m, 3, 2) in metres: corners projected along the dominant axis of their triangle."""
+    """Texture coordinates (m, 3, 2) in metres: corners projected along the main axis of the triangle."""
     corners = vertices[triangles]
     normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     axis = np.argmax(normal, axis=1)
@@ -60,7 +62,7 @@ def merged(shapes: Sequence[Shape]) -> Shape:
 _BOX_QUADS = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
-def box(low: Sequence[float], high: Sequence[float]) -> Shape:
+def box(low: Numbers, high: Numbers) -> Shape:
     """Axis-parallel box; parts 0..5: bottom, top, -y, +x, +y, -x."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     base = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
@@ -72,8 +74,8 @@ def box(low: Sequence[float], high: Sequence[float]) -> Shape:
 def loft(rings: F64, closed_ends: bool = True) -> Shape:
     """Solid through cross sections ``rings`` (k, n, 3).
 
-    Seen against the direction from first to last ring, each ring runs counter-clockwise. Part 0 are the sides,
-    part 1 the end caps (fans around the ring's mean, so rings must be star-shaped about it).
+    Seen against the direction from first to last ring, each ring runs counter-clockwise. Part 0 are the
+    sides, part 1 the end caps (fans around the ring's mean, so rings must be star-shaped about it).
     """
     k, n, _ = rings.shape
     i, j = np.meshgrid(np.arange(k - 1), np.arange(n), indexing="ij")
@@ -99,7 +101,7 @@ def prism(polygon: Sequence[tuple[float, float]], y0: float, y1: float) -> Shape
     return loft(rings)
 
 
-def tube(path: F64, radius: Sequence[float], sides: int = 10) -> Shape:
+def tube(path: F64, radius: Numbers, sides: int = 10) -> Shape:
     """Round solid along ``path`` (k, 3) with a radius at each point; texture wraps around it in metres."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -136,7 +138,7 @@ def cylinder(radius: float, z0: float, z1: float, sides: int = 12, top_radius: f
     )
 
 
-def ellipsoid(radii: Sequence[float], sides: int = 12, rings: int = 8) -> Shape:
+def ellipsoid(radii: Numbers, sides: int = 12, rings: int = 8) -> Shape:
     """Ellipsoid about the origin (z radius last)."""
     theta = np.pi * (np.arange(rings) + 0.5) / rings - np.pi / 2
     phi = 2 * np.pi * np.arange(sides) / sides
@@ -149,7 +151,7 @@ def ellipsoid(radii: Sequence[float], sides: int = 12, rings: int = 8) -> Shape:
     return solid(vertices * np.asarray(radii, np.float64), shape.triangles)
 
 
-def limb(a: Sequence[float], b: Sequence[float], ra: float, rb: float, sides: int = 10) -> Shape:
+def limb(a: Numbers, b: Numbers, ra: float, rb: float, sides: int = 10) -> Shape:
     """Rounded limb between two points: a tube with hemispherical ends."""
     start, end = np.asarray(a, np.float64), np.asarray(b, np.float64)
     axis = (end - start) / np.linalg.norm(end - start)

@@ -62,16 +62,36 @@ class _Layout:
         """Half cross section: distances from the middle and heights above the middle of the road."""
         crown = 0.02 * self.road  # 2 % fall towards the gutter
         kerb = self.road + 0.15
-        y = [0.0, 0.06, self.road - 2.1, self.road - 0.25, self.road, self.road + 0.012, kerb, self.front, self.front + 12]  # fmt: skip
+        y = [
+            0.0,
+            0.06,
+            self.road - 2.1,
+            self.road - 0.25,
+            self.road,
+            self.road + 0.012,
+            kerb,
+            self.front,
+            self.front + 12,
+        ]
         gutter = -crown
         top = gutter + KERB_M
         fall = 0.015 * self.pavement
-        z = [0.0, -0.001, -crown * 0.5, gutter + 0.01, gutter, top, top + 0.003, top + fall, top + fall + 0.02]
+        z = [
+            0.0,
+            -0.001,
+            -crown * 0.5,
+            gutter + 0.01,
+            gutter,
+            top,
+            top + 0.003,
+            top + fall,
+            top + fall + 0.02,
+        ]
         return np.array(y), np.array(z)
 
 
 def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -> World:
-    """A street of at least ``length`` metres (whole blocks of 40 m); the seed decides layout, sizes, colours."""
+    """A street of at least ``length`` metres (whole blocks); the seed decides layout, sizes and colours."""
     blocks = max(int(np.ceil(length / BLOCK_M)), 2)
     rng = np.random.default_rng([seed, 1])
     layout = _Layout(
@@ -80,15 +100,20 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
         road=float(rng.uniform(3.9, 4.8)),
         pavement=float(rng.uniform(2.4, 3.4)),
         wave=(float(rng.uniform(0.05, 0.25)), float(rng.uniform(45, 80)), float(rng.uniform(0, 2 * np.pi))),
-        tints=tuple(tuple((rng.uniform(0.85, 1.1) * np.array(c)).tolist()) for c in ((1, 1, 1), (0.85, 0.82, 0.78), (0.95, 0.95, 0.93))),  # fmt: skip
+        tints=tuple(
+            tuple((rng.uniform(0.85, 1.1) * np.array(c)).tolist())
+            for c in ((1, 1, 1), (0.85, 0.82, 0.78), (0.95, 0.95, 0.93))
+        ),
     )
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 60))
-    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])  # fmt: skip
+    sun = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
     atlas = build_atlas(seed) if atlas is None else atlas
     return World(
         name="street",
         seed=seed,
-        block_edges=np.arange(blocks + 1) * BLOCK_M,
+        block_edges=np.arange(blocks + 1, dtype=np.float64) * BLOCK_M,
         build_block=lambda k: _block(layout, atlas, k, blocks),
         path=_path(layout, rng),
         sun=sun,
@@ -218,15 +243,36 @@ def _add_furniture(builder: MeshBuilder, layout: _Layout, rng: Rng, x0: float, s
     near_kerb = layout.road + 0.55
     near_house = layout.front - 0.5
     slots = x0 + 1.2 + np.arange(14) * (BLOCK_M - 2.4) / 13 + rng.uniform(-0.35, 0.35, 14)
-    kinds = ["tree", "lamp", "tree", "sign", "person", "bench", "bin", "tree", "person", "boxes", "bollard", "cabinet", "bollard", "bench"]  # fmt: skip
+    kinds = [
+        "tree",
+        "lamp",
+        "tree",
+        "sign",
+        "person",
+        "bench",
+        "bin",
+        "tree",
+        "person",
+        "boxes",
+        "bollard",
+        "cabinet",
+        "bollard",
+        "bench",
+    ]
     for x, kind in zip(slots, rng.permutation(kinds), strict=True):
         if kind == "tree":
             furniture.add_tree(builder, rng, _side_pose(layout, x, near_kerb + 0.1, side, rng.uniform(0, 6)))
         elif kind == "lamp":
             furniture.add_lamp(builder, rng, _side_pose(layout, x, near_kerb - 0.15, side, -np.pi / 2))
         elif kind == "sign":
-            T = _side_pose(layout, x, near_kerb, 1.0) if side > 0 else _side_pose(layout, x, near_kerb, -1.0, np.pi)  # fmt: skip
-            furniture.add_road_sign(builder, rng, T @ pose(yaw=np.pi if side > 0 and rng.random() < 0.5 else 0.0))
+            T = (
+                _side_pose(layout, x, near_kerb, 1.0)
+                if side > 0
+                else _side_pose(layout, x, near_kerb, -1.0, np.pi)
+            )
+            furniture.add_road_sign(
+                builder, rng, T @ pose(yaw=np.pi if side > 0 and rng.random() < 0.5 else 0.0)
+            )
         elif kind == "person":
             y = rng.uniform(near_kerb + 0.4, near_house - 0.2)
             furniture.add_person(builder, rng, _side_pose(layout, x, y, side, rng.uniform(0, 2 * np.pi)))

@@ -1,8 +1,8 @@
 """Procedural materials: seeded, tileable, rich at the scale of centimetres, packed for compiled lookup.
 
-Every material is a square picture of ``metres`` width that repeats, a reflectivity at the LiDAR's 905 nm, and a
-gloss. Pictures are drawn around mid grey where an object's tint colours them. A slow grey "macro" picture is
-multiplied on top with other periods, so that the repetition does not show.
+Every material is a square picture of ``metres`` width that repeats, a reflectivity at the LiDAR's 905 nm, and
+a gloss. Pictures are drawn around mid grey where an object's tint colours them. A slow grey "macro" picture
+is multiplied on top with other periods, so that the repetition does not show.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import string
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
 
 Rng = np.random.Generator
+I64 = NDArray[np.int64]
 SIZE = 512  # pixels of a material's picture, power of two
 LEVELS = 9  # mip levels kept: 512 .. 2
 SHOP_SIGNS = 12
@@ -28,22 +30,27 @@ MACRO = 0
 MACRO_M = 11.3  # its width in metres
 
 
-@dataclass(frozen=True, slots=True)
-class TextureAtlas:
-    """All materials of a world as flat arrays.
+class TextureArrays(NamedTuple):
+    """All materials as kernels take them.
 
-    ``texels`` int32 (n,) red, green << 8, blue << 16; ``start`` int64 (materials, LEVELS) first texel of a mip level (square pictures
-    of SIZE >> level pixels); ``metres`` float32 (materials,) width of a picture; ``reflectivity`` float32 0..1 at
-    905 nm and ``gloss`` float32 0..1 share of mirrored sky; ``mean_luma`` float32 mean brightness 0..255;
-    ``index`` material number by name.
+    ``texels`` int32 (n,) red, green << 8, blue << 16; ``start`` int64 (materials, LEVELS) first texel of a
+    mip level (square pictures of SIZE >> level pixels); per material float32: ``metres`` width of a picture,
+    ``reflectivity`` 0..1 at 905 nm, ``gloss`` 0..1 share of mirrored sky, ``mean_luma`` brightness 0..255.
     """
 
     texels: I32
-    start: NDArray[np.int64]
+    start: I64
     metres: F32
     reflectivity: F32
     gloss: F32
     mean_luma: F32
+
+
+@dataclass(frozen=True, slots=True)
+class TextureAtlas:
+    """The materials of a world; ``index`` maps names to material numbers."""
+
+    arrays: TextureArrays
     index: dict[str, int]
 
 
@@ -67,14 +74,14 @@ def fractal(rng: Rng, cells: tuple[int, ...], size: int = SIZE) -> F64:
 
 
 def _tinted(brightness: F64, colour: tuple[float, float, float]) -> F64:
-    return brightness[..., None] * np.array(colour)
+    return np.asarray(brightness[..., None] * np.array(colour))
 
 
 def _grain(rng: Rng, strength: float) -> F64:
     return np.asarray(rng.normal(0, strength, (SIZE, SIZE)))
 
 
-def _write(picture: F64, text: str, box: tuple[int, int, int, int], colour: Sequence[float]) -> None:
+def _write(picture: F64, text: str, box: tuple[int, int, int, int], colour: Sequence[float] | F64) -> None:
     """Letters that fill ``box`` (x, y, width, height) of the picture, whatever the font's own size."""
     x, y, width, height = box
     mask = np.zeros((200, 120 + 90 * len(text)), np.uint8)
@@ -134,7 +141,7 @@ def _masonry(
     picture = _tinted(body, (1.0, 1.0, 1.0))
     picture[..., 0] += hue
     picture[..., 2] -= hue
-    return stone[..., None] * picture + (1 - stone[..., None]) * _tinted(joint, (1, 0.98, 0.94))
+    return np.asarray(stone[..., None] * picture + (1 - stone[..., None]) * _tinted(joint, (1, 0.98, 0.94)))
 
 
 def _plaster(rng: Rng) -> F64:
@@ -193,7 +200,7 @@ def _metal(rng: Rng) -> F64:
     brushed = cv2.resize(rng.uniform(-1, 1, (SIZE, 24)), (SIZE, SIZE), interpolation=cv2.INTER_LINEAR)
     base = 0.72 + 0.05 * brushed + 0.05 * fractal(rng, (8, 30)) + _grain(rng, 0.015)
     rust = np.clip(3 * (fractal(rng, (14, 40, 120)) - 0.45), 0, 1)[..., None]
-    return (1 - rust) * _tinted(base, (1, 1, 1)) + rust * np.array([0.45, 0.27, 0.14])
+    return np.asarray((1 - rust) * _tinted(base, (1, 1, 1)) + rust * np.array([0.45, 0.27, 0.14]))
 
 
 def _window(rng: Rng) -> F64:
@@ -207,7 +214,16 @@ def _window(rng: Rng) -> F64:
     picture[:, right:] = folds[None, right:, None] * colour
     for _ in range(4):
         x0, height = rng.integers(80, 420), rng.integers(30, 110)
-        cv2.ellipse(picture, (int(x0), SIZE - 10), (int(height // 3), int(height)), 0, 0, 360, rng.uniform(0.1, 0.7, 3).tolist(), -1)  # fmt: skip
+        cv2.ellipse(
+            picture,
+            (int(x0), SIZE - 10),
+            (int(height // 3), int(height)),
+            0,
+            0,
+            360,
+            rng.uniform(0.1, 0.7, 3).tolist(),
+            -1,
+        )
     picture += 0.05 * value_noise(rng, 5)[..., None]
     bar = 14
     picture[:, SIZE // 2 - bar : SIZE // 2 + bar] = 0.85
@@ -395,12 +411,12 @@ def build_atlas(seed: int) -> TextureAtlas:
             count += len(levels[-1])
             half = picture.shape[0] // 2
             picture = cv2.resize(picture, (half, half), interpolation=cv2.INTER_AREA)
-    return TextureAtlas(
+    arrays = TextureArrays(
         np.concatenate(levels),
         start,
         np.array([r.metres for r in recipes.values()], np.float32),
         np.array([r.reflectivity for r in recipes.values()], np.float32),
         np.array([r.gloss for r in recipes.values()], np.float32),
         luma,
-        {name: m for m, name in enumerate(recipes)},
     )
+    return TextureAtlas(arrays, {name: m for m, name in enumerate(recipes)})

@@ -79,7 +79,11 @@ def _head(t: F64, step: F64, gait: Gait, rng: Rng) -> F64:
     """Yaw, pitch, roll about the heading, degrees (n, 3): gait, slow drift, looks around."""
     phase = rng.uniform(0, 2 * np.pi, 6)
     yaw = 1.5 * np.sin(step / 2 + phase[0]) + 3.0 * np.sin(2 * np.pi * t / 5.3 + phase[1])
-    pitch = gait.tilt_down_deg + gait.pitch_deg * np.sin(step + phase[2]) + 1.5 * np.sin(2 * np.pi * t / 4.1 + phase[3])  # fmt: skip
+    pitch = (
+        gait.tilt_down_deg
+        + gait.pitch_deg * np.sin(step + phase[2])
+        + 1.5 * np.sin(2 * np.pi * t / 4.1 + phase[3])
+    )
     roll = gait.roll_deg * np.sin(step / 2 + phase[4]) + 1.0 * np.sin(2 * np.pi * t / 6.7 + phase[5])
     side = rng.choice([-1.0, 1.0])
     begin = gait.still_s + 1.5

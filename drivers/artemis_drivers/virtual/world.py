@@ -1,7 +1,7 @@
 """A virtual world: what every street, yard or hall offers to the virtual sensors.
 
-A world is cut into blocks along its walkable path. A block is built from the seed and its number alone, so that
-a walk of twenty minutes through ever new places needs only the blocks around the sensor in memory.
+A world is cut into blocks along its walkable path. A block is built from the seed and its number alone, so
+that a walk of twenty minutes through ever new places needs only the blocks around the sensor in memory.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class World:
     """A seeded world.
 
     ``block_edges`` float64 (blocks + 1,): block k covers x in ``block_edges[k]..block_edges[k + 1]`` metres;
-    ``build_block(k)`` makes its triangles; ``path`` float64 (n, 3) is the line a walker's eyes follow, metres;
-    ``sun`` unit vector towards the sun.
+    ``build_block(k)`` makes its triangles; ``path`` float64 (n, 3) is the line a walker's eyes follow,
+    metres; ``sun`` unit vector towards the sun.
     """
 
     name: str
