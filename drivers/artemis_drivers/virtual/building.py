@@ -259,7 +259,7 @@ def _add_shop_signs(builder: MeshBuilder, rng: Rng, style: HouseStyle, holes: li
     material = f"shop_sign_{rng.integers(SHOP_SIGNS)}"
     left, right = min(h.x0 for h in shops), max(h.x1 for h in shops)
     wide = min(right - left, rng.uniform(2.0, 3.4))
-    x = rng.uniform(left, right - wide)
+    x = left + rng.random() * (right - left - wide)
     builder.begin("sign")
     T_board = T @ pose(x, -0.09, style.ground_floor_m - 0.82)
     builder.add(fitted_panel(wide, 0.62, 0.12), (material, "metal"), (1, 1, 1), T_board)

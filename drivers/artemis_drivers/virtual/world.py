@@ -40,9 +40,9 @@ class World:
 
     def blocks_near(self, x: float, reach_m: float) -> range:
         """Numbers of the blocks that have a part within ``reach_m`` of ``x``."""
-        first = int(np.searchsorted(self.block_edges[1:], x - reach_m, side="right"))
+        first = min(int(np.searchsorted(self.block_edges[1:], x - reach_m)), self.block_count - 1)
         last = int(np.searchsorted(self.block_edges[:-1], x + reach_m, side="left"))
-        return range(min(first, self.block_count - 1), max(last, first + 1))
+        return range(first, max(last, first + 1))
 
     def mesh(self, blocks: range | None = None) -> WorldMesh:
         """Triangles of the given blocks (all without)."""
