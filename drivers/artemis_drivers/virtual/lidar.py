@@ -81,7 +81,7 @@ def _reflectivity(triangle: I32, hit: F64, surface: Surface, textures: TextureAr
         row, m = surface.rows[triangle[i]], surface.look[triangle[i], 3]
         u = row[4] * hit[i, 0] + row[5] * hit[i, 1] + row[6] * hit[i, 2] + row[7]
         v = row[8] * hit[i, 0] + row[9] * hit[i, 1] + row[10] * hit[i, 2] + row[11]
-        r, g, b = sample(textures, m, u, v, 3.0)
+        r, g, b = sample(textures.texels, textures.start, m, u, v, 3.0)
         bright = 0.5 + 0.5 * (r + g + b) / (3.0 * max(textures.mean_luma[m], 1.0))
         out[i] = min(max(textures.reflectivity[m] * bright, 0.01), 1.0)
 

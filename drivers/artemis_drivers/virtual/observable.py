@@ -9,6 +9,7 @@ twice the reach are not asked for, whatever the mapping did with the points.
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,7 +28,8 @@ _TRIES = 3  # beams asked for a free line before a point is given up
 _SLACK_M = 0.005
 _CELL_M = 2 * REACH_M
 _COARSE_M = 0.5
-_PORTION = 2_000_000  # points handled at once: bounds memory
+_PORTION = 1_000_000  # points handled at once by each worker: bounds memory
+_WORKERS = 2  # the kernels release the interpreter lock; the result does not depend on it
 _EMPTY = np.int64(-1)
 
 
@@ -88,14 +90,16 @@ def observed_surface(mesh: WorldMesh, scene: Scene, store: HitStore, spacing_m: 
     near = np.flatnonzero(((local >= low) & (local <= high)).all(axis=1))
     beams = _beams_index(local[near], store.origin[near] - scene.origin, store.instance[near])
     _, normals = mesh.areas_and_normals()
-    pieces = [
-        _observed_part(corners[part], normals[part], mesh.instance[part], spacing_m, beams, scene)
-        for part in _portions(corners, spacing_m)
-    ]
-    points = np.concatenate([p for p, _ in pieces])
-    triangle = np.concatenate(
-        [t + part.start for (_, t), part in zip(pieces, _portions(corners, spacing_m), strict=True)]
-    )
+    parts = _portions(corners, spacing_m)
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        pieces = list(
+            pool.map(
+                lambda p: _observed_part(corners[p], normals[p], mesh.instance[p], spacing_m, beams, scene),
+                parts,
+            )
+        )
+    points = np.concatenate([points for points, _ in pieces])
+    triangle = np.concatenate([t + part.start for (_, t), part in zip(pieces, parts, strict=True)])
     return ObservedSurface(
         (points + scene.origin).astype(np.float32),
         normals[triangle].astype(np.float32),

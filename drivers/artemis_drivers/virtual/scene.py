@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_drivers.virtual.mesh_builder import F32, F64, U8, WorldMesh, joined
+from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8, WorldMesh, joined
 from artemis_drivers.virtual.raycast import Bvh, build_bvh
-from artemis_drivers.virtual.textures import SIZE, TextureAtlas
+from artemis_drivers.virtual.textures import MACRO_M, SIZE, TextureAtlas
 from artemis_drivers.virtual.world import World
 
 
@@ -30,12 +30,19 @@ class Surface(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Triangles around the sensors; ``origin`` float64 (3,) of the float32 coordinates in ``surface``."""
+    """Triangles around the sensors; ``origin`` float64 (3,) of the float32 coordinates in ``surface``.
+
+    ``object_of`` int32 (m,) numbers the objects 0..k - 1 of the triangles; ``object_centre`` float64 (k, 3), local,
+    and ``object_radius`` (k,) enclose them.
+    """
 
     mesh: WorldMesh
     bvh: Bvh
     surface: Surface
     atlas: TextureAtlas
+    object_of: I32
+    object_centre: F64
+    object_radius: F64
 
     @property
     def origin(self) -> F64:
@@ -46,7 +53,18 @@ class Scene:
 def prepare(mesh: WorldMesh, atlas: TextureAtlas) -> Scene:
     """Scene of a mesh."""
     bvh = build_bvh(mesh.corners())
-    return Scene(mesh, bvh, _surface(mesh, atlas, bvh.origin), atlas)
+    return Scene(mesh, bvh, _surface(mesh, atlas, bvh.origin), atlas, *_objects(mesh, bvh.origin))
+
+
+def _objects(mesh: WorldMesh, origin: F64) -> tuple[I32, F64, F64]:
+    """Number of each triangle's object, and a sphere around each object."""
+    _, number = np.unique(mesh.instance, return_inverse=True)
+    count = int(number.max()) + 1 if len(number) else 0
+    corners = mesh.corners().astype(np.float64) - origin
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, number, corners.min(axis=1))
+    np.maximum.at(high, number, corners.max(axis=1))
+    return number.astype(np.int32), (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
 
 
 def _surface(mesh: WorldMesh, atlas: TextureAtlas, origin: F64) -> Surface:
@@ -61,13 +79,15 @@ def _surface(mesh: WorldMesh, atlas: TextureAtlas, origin: F64) -> Surface:
     unit = normal / np.sqrt(squared)
     rows = np.zeros((len(corners), 16), np.float32)
     rows[:, :3], rows[:, 3] = unit, (unit * a).sum(axis=1)
+    metres = atlas.arrays.metres[mesh.material].astype(np.float64)
     for k in range(2):
-        gradient = du[:, k, None] * d1 + dv[:, k, None] * d2
+        gradient = (du[:, k, None] * d1 + dv[:, k, None] * d2) / metres[:, None]
         rows[:, 4 + 4 * k : 7 + 4 * k] = gradient
-        rows[:, 7 + 4 * k] = texture[:, 0, k] - (gradient * a).sum(axis=1)
+        rows[:, 7 + 4 * k] = texture[:, 0, k] / metres - (gradient * a).sum(axis=1)
     stretch = np.sqrt(np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]) / np.sqrt(squared[:, 0]))
-    rows[:, 12] = stretch * SIZE / atlas.arrays.metres[mesh.material]
-    rows[:, 13:15] = (mesh.instance[:, None].astype(np.int64) * [7919, 104729]) % 1009 / 1009.0 * 11.3
+    rows[:, 12] = np.log2(np.maximum(stretch * SIZE / metres, 1e-6))
+    rows[:, 13:15] = (mesh.instance[:, None].astype(np.int64) * [7919, 104729]) % 1009 / 1009.0
+    rows[:, 15] = metres / MACRO_M
     look = np.column_stack([mesh.tint, mesh.material.astype(np.uint8)])
     return Surface(rows, look, _continuation_key(rows, look, mesh.instance))
 

@@ -39,7 +39,7 @@ class _Layout:
     road: float  # half width of the road
     pavement: float
     wave: tuple[float, float, float]  # long waves of the ground: amplitude, length, phase
-    tints: tuple[tuple[float, float, float], ...]  # road, pavement, kerb
+    tints: tuple[tuple[float, float, float], ...]  # road, pavement, kerb, gutter
 
     @property
     def front(self) -> float:
@@ -102,7 +102,7 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
         wave=(float(rng.uniform(0.05, 0.25)), float(rng.uniform(45, 80)), float(rng.uniform(0, 2 * np.pi))),
         tints=tuple(
             tuple((rng.uniform(0.85, 1.1) * np.array(c)).tolist())
-            for c in ((1, 1, 1), (0.85, 0.82, 0.78), (0.95, 0.95, 0.93))
+            for c in ((1, 1, 1), (0.85, 0.82, 0.78), (0.95, 0.95, 0.93), (0.55, 0.54, 0.53))
         ),
     )
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 60))
@@ -162,7 +162,7 @@ def _add_ground(builder: MeshBuilder, layout: _Layout, x0: float) -> None:
     level = layout.level(xs)
     side, height = layout.section()
     materials = ["lane_paint", "asphalt", "asphalt", "cobbles", "kerbstone", "kerbstone", "paving", "paving"]
-    tints = [0, 0, 0, 0, 2, 2, 1, 1]
+    tints = [0, 0, 0, 3, 2, 2, 1, 1]
     every = np.ones(len(xs) - 1, bool)
     dash = (np.floor((xs[:-1] + 0.5) / 3.0) % 2) == 0
     builder.begin("ground")
