@@ -121,25 +121,6 @@ class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = ""
 
 
-class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """Which topics of a bag are read, where it holds more than one of a kind (datasets/rosbag.py)."""
-
-    lidar_topics: Annotated[
-        tuple[str, ...],
-        Meta(
-            description="Cloud topics, the primary LiDAR first; empty: one for each LiDAR frame of the bag."
-        ),
-    ] = ()
-    image_topics: Annotated[
-        tuple[str, ...], Meta(description="Image topics; empty: one for each camera frame of the bag.")
-    ] = ()
-    imu_topic: Annotated[str, Meta(description="IMU topic; empty: the first by name.")] = ""
-    odometry_topic: Annotated[
-        str,
-        Meta(description="Odometry topic whose poses are used where tf has none; empty: the first by name."),
-    ] = ""
-
-
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole configuration: one section a stage."""
 

@@ -135,14 +135,17 @@ class Trajectory:
 class FrameSource(Protocol):
     """A recording, a foreign data set or the live rig: the pipeline cannot tell which.
 
-    ``poses`` are those the input itself carries (tf, poses of a data set), or None. ``input_hz`` is the frame
-    rate of the recording. ``lost`` counts what could not be read, by reason.
+    ``stamp_ns`` (n,) are the stamps of all frames. ``poses`` are those the input itself carries (tf, poses of a
+    data set), or None. ``input_hz`` is the frame rate of the recording. ``lost`` counts what could not be read,
+    by reason; ``warnings`` are sentences for the user about what is unusual.
     """
 
     name: str
+    stamp_ns: I64
     poses: Trajectory | None
     input_hz: float
     lost: dict[str, int]
+    warnings: list[str]
 
     def __len__(self) -> int:
         """Number of frames."""

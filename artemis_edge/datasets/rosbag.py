@@ -71,7 +71,7 @@ class RosbagSource:
 
     def __init__(self, path: Path, config: InputConfig | None = None) -> None:
         config = config or InputConfig()
-        index = BagIndex(_open_bags(path))
+        index = BagIndex(open_bags(path))
         self.name = path.resolve().stem if path.is_file() else path.resolve().name
         self._lidars = find_lidars(index, config)
         lidar_frame = self._lidars[0].track.frame_id
@@ -150,7 +150,8 @@ def bag_files(path: Path) -> list[Path]:
     return []
 
 
-def _open_bags(path: Path) -> list[Bag]:
+def open_bags(path: Path) -> list[Bag]:
+    """All files of the recording at a path; InputError if one cannot be read."""
     return [_open_bag(file) for file in bag_files(path)]
 
 

@@ -23,15 +23,20 @@ __all__ = ["Evaluation", "RunStatistics", "write_report"]
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What was measured against a reference or against a virtual world's truth, where there is one."""
+    """What was measured against a reference or against a virtual world's truth, where there is one.
+
+    ``world`` are the shares of ``session.truth.TruthReport``.
+    """
 
     mesh: MeshEvaluation | None = None
     trajectory: TrajectoryEvaluation | None = None
+    world: Mapping[str, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The JSON objects of the ``evaluate`` commands, by name."""
         parts = (("mesh", self.mesh), ("trajectory", self.trajectory))
-        return {name: part.to_json() for name, part in parts if part is not None}
+        found: dict[str, Any] = {name: part.to_json() for name, part in parts if part is not None}
+        return found if self.world is None else found | {"world": dict(self.world)}
 
 
 def write_report(

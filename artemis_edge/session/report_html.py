@@ -173,6 +173,7 @@ def _scores(measured: dict[str, Any]) -> str:
                 f"{edges['orientation_share']:.3%} consistently oriented",
             )
         )
+    rows += _world_scores(measured.get("world"))
     path = measured.get("trajectory")
     if path is not None:
         rows.append(
@@ -187,6 +188,16 @@ def _scores(measured: dict[str, Any]) -> str:
             for length, e in path["rpe"].items()
         ]
     return f"<h2>Measured against the reference</h2>{_table(rows)}" if rows else ""
+
+
+def _world_scores(world: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """Shares are None where nothing could be judged."""
+    if world is None or world["wound_share"] is None or world["bridging_area_share"] is None:
+        return []
+    return [
+        ("Wound as the world", f"{world['wound_share']:.3%} of {world['judged']:,} triangles"),
+        ("Bridging a gap", f"{world['bridging_area_share']:.3%} of the area"),
+    ]
 
 
 def _run_table(report: dict[str, Any]) -> str:

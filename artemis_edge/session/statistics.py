@@ -23,7 +23,7 @@ class RunStatistics:
     ``frame_ms`` wall time from the frame handed in to its delta ready; ``cpu_ms`` CPU time (user + system) of
     all threads that run the stages; ``stage_ms`` wall time by stage, in the order of the pipeline.
     ``flush_ms`` is the postponed work done once after the last frame, ``warmup_s`` what came before the first
-    frame; neither is in ``frame_ms``. ``frames_dropped`` were in the input and are not in the map, ``lost``
+    frame; neither is in ``frame_ms``, but ``flush_cpu_ms`` is part of the mean CPU time. ``frames_dropped`` were in the input and are not in the map, ``lost``
     says what and why, by reason. ``input_hz`` 0 when the input has no rate. ``peak_rss_mb`` is measured when
     the report is written unless it is set.
     """
@@ -34,6 +34,7 @@ class RunStatistics:
     cpu_ms: list[float] = field(default_factory=list)
     stage_ms: dict[str, list[float]] = field(default_factory=dict)
     flush_ms: float = 0.0
+    flush_cpu_ms: float = 0.0
     warmup_s: float = 0.0
     frames_dropped: int = 0
     lost: dict[str, int] = field(default_factory=dict)
@@ -62,7 +63,7 @@ class RunStatistics:
             "frames_dropped": self.frames_dropped,
             "lost": dict(sorted(self.lost.items())),
             "frame_ms": _figures(self.frame_ms, ("p50", "p95", "p99", "mean", "max")),
-            "cpu_ms": _figures(self.cpu_ms, ("p50", "mean")),
+            "cpu_ms": _figures(self.cpu_ms, ("p50", "mean")) | {"mean": self._cpu_mean_ms()},
             "stages": {
                 name: _figures(times, ("p50", "p99", "mean")) for name, times in self.stage_ms.items()
             },
@@ -74,6 +75,11 @@ class RunStatistics:
             "input_hz": round(self.input_hz, _DIGITS),
             "versions": versions(),
         }
+
+    def _cpu_mean_ms(self) -> float:
+        """CPU time of all frames and of the flush, divided by the frames."""
+        spent_ms = sum(self.cpu_ms) + self.flush_cpu_ms
+        return round(spent_ms / max(len(self.cpu_ms), 1), _DIGITS)
 
     def _realtime_factor(self) -> float | None:
         """How many times faster than the input all frames and the flush were; None if it has no pace."""

@@ -1,0 +1,378 @@
+"""The command line: what can be asked, and how errors are told. Other modules do the work."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from artemis_edge.errors import InputError, UserError
+
+Handler = Callable[[argparse.Namespace], int]
+
+DONE, FELL_SHORT, BAD_USE = 0, 1, 2
+DEMO_OUT = Path("demo-out")
+_DEMO_SECONDS, _SIMULATED_SECONDS, _SEED = 20.0, 20.0, 1
+
+
+class _Parser(argparse.ArgumentParser):
+    """Usage errors are one line and say where help is."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_USE, f"{self.prog}: {message}; see '{self.prog} --help'\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code: 0 done, 1 ran and failed or fell short, 2 bad use or input."""
+    try:
+        given = _parser().parse_args(arguments)
+        handler: Handler = given.handler
+        code = handler(given)
+        sys.stdout.flush()
+        return code
+    except SystemExit as ending:  # argparse, after help or a usage error
+        return ending.code if isinstance(ending.code, int) else BAD_USE
+    except UserError as error:
+        return _tell(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        return _tell("interrupted; complete results are kept, nothing half-written is left", FELL_SHORT)
+    except BrokenPipeError:
+        # Whoever read our output has left; Python must not try to flush it again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FELL_SHORT
+    except MemoryError:
+        return _tell(
+            "not enough memory; close other programs or lower voxel_map.memory_budget_mb", FELL_SHORT
+        )
+    except OSError as error:
+        return _tell(_os_sentence(error), FELL_SHORT)
+
+
+def _tell(sentence: str, code: int) -> int:
+    print(f"artemis-edge: {sentence}", file=sys.stderr)
+    return code
+
+
+def _os_sentence(error: OSError) -> str:
+    what = f"{error.filename}: " if error.filename else ""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{what}the disk is full; free space or choose another place"
+    return f"{what}{error.strerror or error}; check that it is there and that you may use it"
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value, ensure_ascii=False, allow_nan=False))
+
+
+# --- the grammar
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="artemis-edge",
+        description="LiDAR, camera and IMU mapping: from scans to a triangle mesh.",
+        epilog="'artemis-edge COMMAND --help' explains a command; docs/operator.md tells how it is used.",
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for add in (_demo, _simulate, _reprocess, _evaluate, _bench, _render, _export, _check, _session):
+        add(commands)
+    return parser
+
+
+def _version() -> str:
+    from importlib import metadata
+
+    return f"artemis-edge {metadata.version('artemis-edge')}"
+
+
+def _command(commands: Any, name: str, handler: Handler, text: str) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
+    parser.set_defaults(handler=handler)
+    return parser
+
+
+def _json_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+
+
+def _config_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--profile", metavar="NAME", help="a set of settings that ships with the program")
+    parser.add_argument(
+        "--set", metavar="SECTION.FIELD=VALUE", action="append", default=[], dest="sets",
+        help="one setting (docs/tuning.md lists them); may be repeated",
+    )  # fmt: skip
+
+
+def _demo(commands: Any) -> None:
+    parser = _command(commands, "demo", run_demo, "walk through a virtual world, map it, measure the map")
+    parser.add_argument("--world", default="street", metavar="NAME", help="virtual world (default: street)")
+    parser.add_argument(
+        "--seconds", type=float, default=_DEMO_SECONDS, help="length of the walk (default: 20)"
+    )
+    parser.add_argument("--out", type=Path, default=DEMO_OUT, metavar="DIR", help="default: ./demo-out")
+
+
+def _simulate(commands: Any) -> None:
+    parser = _command(
+        commands, "simulate", run_simulate, "record a session in a virtual world, with its truth"
+    )
+    parser.add_argument("world", metavar="WORLD", help="virtual world, for example street")
+    parser.add_argument("--seed", type=int, default=_SEED, help="which of its variants (default: 1)")
+    parser.add_argument("--seconds", type=float, default=_SIMULATED_SECONDS, help="length (default: 20)")
+    parser.add_argument("--lidar", default="avia", help="virtual LiDAR (default: avia)")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="sets")
+    parser.add_argument("--out", type=Path, required=True, metavar="SESSION", help="folder to write")
+
+
+def _reprocess(commands: Any) -> None:
+    parser = _command(
+        commands, "reprocess", run_reprocess, "map recordings: from an input to a mesh and report"
+    )
+    parser.add_argument(
+        "inputs", nargs="+", type=Path, metavar="INPUT",
+        help="a session, a ROS 1 or ROS 2 bag, a KITTI odometry sequence or a KITTI raw drive",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    poses = parser.add_mutually_exclusive_group()
+    poses.add_argument("--poses", type=Path, metavar="FILE.tum", help="poses to map with")
+    poses.add_argument(
+        "--no-poses", action="store_true", help="estimate the poses even where the input has some"
+    )
+    _config_options(parser)
+    parser.add_argument(
+        "--frames", type=_span, default=(0, None), metavar="A:B", help="frames A <= k < B only"
+    )
+    parser.add_argument(
+        "--holdout", type=_at_least_two, default=0, metavar="N",
+        help="keep every N-th photograph of each camera out of the map and write it to PHOTOS.json",
+    )  # fmt: skip
+    _json_option(parser)
+
+
+def _evaluate(commands: Any) -> None:
+    group = commands.add_parser("evaluate", help="measure a mesh or a trajectory against a reference")
+    kinds = group.add_subparsers(title="kinds", metavar="KIND", required=True)
+    mesh = _command(kinds, "mesh", run_evaluate_mesh, "a mesh against a reference cloud")
+    mesh.add_argument("mesh", type=Path, metavar="MESH", help="an output directory or a mesh.ply")
+    mesh.add_argument("--reference", type=Path, required=True, metavar="CLOUD.ply")
+    mesh.add_argument("--threshold", type=float, action="append", metavar="METRES", help="default: 0.1")
+    mesh.add_argument("--crop", action="store_true", help="leave out the mesh outside the reference's box")
+    mesh.add_argument("--heatmap", type=Path, metavar="FILE.png", help="precision and recall from above")
+    _json_option(mesh)
+    path = _command(kinds, "trajectory", run_evaluate_trajectory, "a trajectory against a reference")
+    path.add_argument("estimate", type=Path, metavar="ESTIMATE.tum")
+    path.add_argument("--reference", type=Path, required=True, metavar="REF.tum")
+    _json_option(path)
+
+
+def _bench(commands: Any) -> None:
+    parser = _command(commands, "bench", run_bench, "measure what a frame costs on this machine")
+    parser.add_argument("input", nargs="?", type=Path, metavar="INPUT", help="default: a virtual Avia walk")
+    parser.add_argument(
+        "--frames", type=int, default=100, metavar="N", help="at most N frames (default: 100)"
+    )
+    _config_options(parser)
+    _json_option(parser)
+
+
+def _render(commands: Any) -> None:
+    parser = _command(commands, "render", run_render, "picture of a map as a camera would take it")
+    parser.add_argument("map", type=Path, metavar="MAP", help="an output directory or a mesh.ply")
+    parser.add_argument("--pose", required=True, metavar='"tx ty tz qx qy qz qw"', help="T_world_cam")
+    parser.add_argument("--intrinsics", required=True, metavar='"w h fx fy cx cy"')
+    parser.add_argument("--distortion", metavar='"k1 k2 p1 p2 k3"')
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
+    parser.add_argument("--depth", type=Path, metavar="FILE.npy", help="metres along z, NaN where nothing")
+
+
+def _export(commands: Any) -> None:
+    parser = _command(commands, "export", run_export, "write a map in another format")
+    parser.add_argument("map", type=Path, metavar="MAP", help="an output directory or a mesh.ply")
+    parser.add_argument("--format", choices=("ply", "glb"), required=True)
+    parser.add_argument("--out", type=Path, required=True, metavar="PATH")
+
+
+def _check(commands: Any) -> None:
+    parser = _command(commands, "check", run_check, "see whether this machine is ready")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="a configuration to check as well")
+    _json_option(parser)
+
+
+def _session(commands: Any) -> None:
+    group = commands.add_parser("session", help="look into recordings")
+    kinds = group.add_subparsers(title="actions", metavar="ACTION", required=True)
+    info = _command(kinds, "info", run_session_info, "topics, counts and duration of a recording")
+    info.add_argument("session", type=Path, metavar="SESSION", help="a session, a bag or a data set")
+    _json_option(info)
+
+
+def _span(text: str) -> tuple[int, int | None]:
+    first, colon, last = text.partition(":")
+    try:
+        start, stop = int(first or 0), int(last) if last else None
+    except ValueError:
+        colon, start, stop = "", 0, None
+    if not colon or start < 0 or (stop is not None and stop <= start):
+        raise argparse.ArgumentTypeError(f"'{text}' is not A:B with 0 <= A < B, for example 0:100")
+    return start, stop
+
+
+def _at_least_two(text: str) -> int:
+    if not text.isdecimal() or int(text) < 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 2 or more")
+    return int(text)
+
+
+# --- the commands
+
+
+def run_demo(given: argparse.Namespace) -> int:
+    """``artemis-edge demo``."""
+    from artemis_edge.session.demo import demo
+
+    print(demo(given.world, given.seconds, _SEED, given.out))
+    return DONE
+
+
+def run_simulate(given: argparse.Namespace) -> int:
+    """``artemis-edge simulate``."""
+    from artemis_edge.progress import progress
+    from artemis_edge.session.results import prepare
+    from artemis_edge.session.simulate import simulate
+
+    settings = dict(_key_value(text) for text in given.sets)
+    prepare(given.out)
+    with progress("simulating") as report:
+        made = simulate(given.world, given.seed, given.seconds, given.lidar, given.out, settings, report)
+    print(f"{made.session}: {made.frames} frames, {made.points} points, {made.images} photographs")
+    print(f"{made.truth}: truth of a walk of {made.length_m:.1f} m")
+    return DONE
+
+
+def _key_value(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise InputError(f"--set {text}: write it as key=value")
+    return key, value
+
+
+def run_reprocess(given: argparse.Namespace) -> int:
+    """``artemis-edge reprocess``."""
+    from artemis_edge import batch, config
+    from artemis_edge.runtime import Request
+
+    start, stop = given.frames
+    outcomes = batch.run_all(
+        [
+            Request(path, out, settings, given.poses, given.no_poses, start, stop, given.holdout)
+            for settings in [config.load(profile=given.profile, sets=given.sets)]
+            for path, out in batch.places(given.inputs, given.out)
+        ],
+        plain=given.json,
+    )
+    reports = {str(outcome.out): outcome.report for outcome in outcomes}
+    if given.json:
+        _print_json(next(iter(reports.values())) if len(given.inputs) == 1 else {"runs": reports})
+    else:
+        for outcome in outcomes:
+            print(batch.summary(outcome))
+    return DONE
+
+
+def run_evaluate_mesh(given: argparse.Namespace) -> int:
+    """``artemis-edge evaluate mesh``."""
+    from artemis_edge.evaluate import mesh
+    from artemis_edge.export.ply import find_mesh
+
+    thresholds = given.threshold or mesh.DEFAULT_THRESHOLDS
+    result = mesh.run(find_mesh(given.mesh), given.reference, thresholds, given.crop)
+    if given.heatmap is not None:
+        from artemis_edge.session.pictures import write_heat_maps
+
+        write_heat_maps(given.heatmap, result)
+    if given.json:
+        _print_json(result.to_json())
+    else:
+        print(mesh.to_text(result))
+    return DONE
+
+
+def run_evaluate_trajectory(given: argparse.Namespace) -> int:
+    """``artemis-edge evaluate trajectory``."""
+    from artemis_edge.evaluate import trajectory
+
+    result = trajectory.run(given.estimate, given.reference)
+    if given.json:
+        _print_json(result.to_json())
+    else:
+        print(trajectory.to_text(result))
+    return DONE
+
+
+def run_bench(given: argparse.Namespace) -> int:
+    """``artemis-edge bench``."""
+    from artemis_edge import bench, config
+
+    if given.frames < 1:
+        raise InputError(f"--frames {given.frames}: give 1 or more")
+    settings = config.load(profile=given.profile, sets=given.sets)
+    result = bench.bench(given.input, given.frames, settings, plain=given.json)
+    if given.json:
+        _print_json(result)
+    else:
+        print(bench.to_text(result))
+    return DONE
+
+
+def run_render(given: argparse.Namespace) -> int:
+    """``artemis-edge render``."""
+    from artemis_edge import render
+
+    render.run(given.map, given.pose, given.intrinsics, given.distortion, given.out, given.depth)
+    return DONE
+
+
+def run_export(given: argparse.Namespace) -> int:
+    """``artemis-edge export``."""
+    from artemis_edge.export.glb import write_glb
+    from artemis_edge.export.ply import find_mesh, read_mesh, write_ply
+
+    if given.out.is_dir():
+        raise InputError(f"{given.out} is a folder; --out needs the name of a file")
+    write = {"ply": write_ply, "glb": write_glb}[given.format]
+    write(given.out, read_mesh(find_mesh(given.map)))
+    return DONE
+
+
+def run_check(given: argparse.Namespace) -> int:
+    """``artemis-edge check``."""
+    from artemis_edge import check
+
+    findings = check.check(given.config)
+    if given.json:
+        _print_json(check.to_json(findings))
+    else:
+        print(check.to_text(findings))
+    return DONE if check.ready(findings) else FELL_SHORT
+
+
+def run_session_info(given: argparse.Namespace) -> int:
+    """``artemis-edge session info``."""
+    from artemis_edge.session import catalog
+
+    found = catalog.catalog(given.session)
+    if given.json:
+        _print_json(found.to_json())
+    else:
+        print(catalog.to_text(found))
+    return DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

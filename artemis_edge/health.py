@@ -1,0 +1,47 @@
+"""What the machine has left: memory, processors, disk. Readings only; whoever asks decides what is enough."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+MB = 1e6
+_KIB = 1024.0
+
+
+def resident_mb() -> float:
+    """Resident memory of this process now, MB of 1e6 bytes; 0 where the system does not say."""
+    return _proc_field(Path("/proc/self/status"), "VmRSS:")
+
+
+def available_memory_mb() -> float:
+    """Memory that new work can take without swapping, MB; 0 where the system does not say."""
+    return _proc_field(Path("/proc/meminfo"), "MemAvailable:")
+
+
+def processors() -> int:
+    """Processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def free_disk_mb(folder: Path) -> float:
+    """Free space in the file system of ``folder`` or of its nearest parent that exists, MB."""
+    place = folder.resolve()
+    while not place.exists():
+        place = place.parent
+    return shutil.disk_usage(place).free / MB
+
+
+def _proc_field(file: Path, name: str) -> float:
+    """A field of /proc given in kB (there: of 1024 bytes), in MB."""
+    try:
+        lines = file.read_text().splitlines()
+    except OSError:
+        return 0.0
+    for line in lines:
+        if line.startswith(name):
+            return float(line.split()[1]) * _KIB / MB
+    return 0.0

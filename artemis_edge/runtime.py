@@ -1,0 +1,207 @@
+"""``reprocess``: from an input to the output directory of the contract."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from artemis_edge.config import Config, to_toml
+from artemis_edge.datasets import lidar_poses, open_input
+from artemis_edge.errors import InputError, RunError
+from artemis_edge.export.glb import write_glb
+from artemis_edge.export.ply import Mesh
+from artemis_edge.frames import FrameSource, Odometry, Trajectory
+from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, warm_up
+from artemis_edge.odometry.given_poses import GivenPoses
+from artemis_edge.odometry.lidar_odometry import LidarOdometry
+from artemis_edge.progress import Report, silent
+from artemis_edge.session.photos import INDEX, HeldOut
+from artemis_edge.session.report import Evaluation, RunStatistics, write_report
+from artemis_edge.session.results import Results, prepare, scratch
+from artemis_edge.trajectory import pose_per_frame, read_tum, write_tum
+
+_WARM_UP_FRAMES = 3
+_WARM_UP_MB = 600
+
+MakeMapper = Callable[[Config, Odometry, Path], Mapper]
+#: What is measured of a finished map, for the report; None where there is no truth.
+Evaluate = Callable[[Mesh, Trajectory], Evaluation]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What to map and how. ``poses`` a TUM file, ``own_odometry`` ignores poses of the input (--no-poses).
+
+    ``start`` and ``stop`` bound the frames (None: the end); ``holdout`` keeps every N-th photograph of each
+    camera out of the map (0: none).
+    """
+
+    input: Path
+    out: Path
+    config: Config = field(default_factory=Config)
+    poses: Path | None = None
+    own_odometry: bool = False
+    start: int = 0
+    stop: int | None = None
+    holdout: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """``report`` is the content of report.json; ``warnings`` are sentences for the user."""
+
+    out: Path
+    report: dict[str, Any]
+    trajectory: Trajectory
+    warnings: list[str]
+
+
+def pipeline(config: Config, odometry: Odometry, page_folder: Path) -> Mapper:
+    """The pipeline of the paper."""
+    from artemis_edge.pipeline import Pipeline
+
+    return Pipeline(config, odometry, page_folder)
+
+
+def reprocess(
+    request: Request,
+    report: Report = silent,
+    evaluate: Evaluate | None = None,
+    make: MakeMapper = pipeline,
+) -> Outcome:
+    """Map an input into ``request.out``.
+
+    Raises InputError when nothing can be done, RunError when the run ended early or a result could not be
+    written; its sentence says what was kept.
+    """
+    source = open_input(request.input, request.config.input)
+    span = frame_span(source, request)
+    odometry = choose_odometry(source, request, span)
+    prepare(request.out)
+    statistics = RunStatistics(source.name, source.input_hz, config_toml=to_toml(request.config))
+    with scratch(request.out) as pages:
+        with Interrupt() as interrupt:
+            warm_up_run(request.config, odometry, pages, source, span, statistics, make)
+            mapper = make(request.config, odometry(), pages)
+            run = MappingRun(mapper, source, span, statistics)
+            photos = HeldOut(request.out, request.holdout)
+            run.frames(report, interrupt, photos.take)
+            if not statistics.frame_ms:
+                raise _nothing_mapped(run, source, span)
+            run.flush()
+        count_losses(statistics, source, mapper)
+        results = Results(request.out)
+        outcome = _write(results, run, mapper, photos, statistics, evaluate)
+    _complain(run, results, request.out)
+    warnings = [*source.warnings, *_skipped(run, statistics)]
+    return Outcome(request.out, outcome or {}, run.trajectory(), warnings)
+
+
+def frame_span(source: FrameSource, request: Request) -> range:
+    """The frames asked for; InputError if the input has none of them."""
+    count = len(source)
+    stop = count if request.stop is None else min(request.stop, count)
+    if not 0 <= request.start < stop:
+        asked = f"{request.start}:{'' if request.stop is None else request.stop}"
+        raise InputError(f"{source.name} has {count} frames, none of them in --frames {asked}")
+    return range(request.start, stop)
+
+
+def choose_odometry(source: FrameSource, request: Request, span: range) -> Callable[[], Odometry]:
+    """Given poses, else those of the input, else the odometry; called once for every run over the frames."""
+    if request.poses is not None:
+        given = lidar_poses(source, read_tum(request.poses))
+        poses = pose_per_frame(given, source.stamp_ns, span.start, span.stop, str(request.poses))
+        return lambda: GivenPoses(poses)
+    if source.poses is not None and len(source.poses) and not request.own_odometry:
+        own = source.poses
+        return lambda: GivenPoses(own)
+    return lambda: LidarOdometry(request.config.odometry)
+
+
+def warm_up_run(
+    config: Config,
+    odometry: Callable[[], Odometry],
+    pages: Path,
+    source: FrameSource,
+    span: range,
+    statistics: RunStatistics,
+    make: MakeMapper,
+) -> None:
+    """Kernels ready before the first frame; the map of the warm-up is as small as can be."""
+    small = msgspec.structs.replace(config.voxel_map, memory_budget_mb=_WARM_UP_MB)
+    tiny = msgspec.structs.replace(config, voxel_map=small)
+    folder = pages / "warm-up"
+    folder.mkdir()
+    statistics.warmup_s = warm_up(lambda: make(tiny, odometry(), folder), source, span, _WARM_UP_FRAMES)
+    gc.collect()
+
+
+def count_losses(statistics: RunStatistics, source: FrameSource, mapper: Mapper) -> None:
+    """What the input could not give and what the stages could not use."""
+    statistics.add_lost(source.lost)
+    statistics.add_lost(mapper.lost)
+    statistics.frames_dropped += source.lost.get("empty_file", 0)
+
+
+def _write(
+    results: Results,
+    run: MappingRun,
+    mapper: Mapper,
+    photos: HeldOut,
+    statistics: RunStatistics,
+    evaluate: Evaluate | None,
+) -> dict[str, Any] | None:
+    """All results, small ones first; returns the report."""
+    trajectory = run.trajectory()
+    results.attempt("trajectory.tum", lambda path: _write_tum(path, trajectory))
+    results.text("config.toml", statistics.config_toml)
+    results.json("objects.json", {"objects": []})
+    if photos.every:
+        lost = results.attempt(INDEX, lambda path: photos.write_index(path, trajectory))
+        statistics.add_lost({"photos_without_pose": lost} if lost else {})
+    mesh = results.attempt("mesh.ply", mapper.write_mesh)
+    statistics.map_bytes = results.directory("map", mapper.save) or 0
+    if mesh is None:
+        return None
+    whole = mesh
+    results.attempt("mesh.glb", lambda path: write_glb(path, whole))
+    evaluation = evaluate(whole, trajectory) if evaluate is not None else None
+    return results.attempt(
+        "report.html",
+        lambda path: write_report(path.parent, whole, trajectory, statistics, (), evaluation),
+    )
+
+
+def _write_tum(path: Path, trajectory: Trajectory) -> None:
+    part = path.with_name(f".{path.name}.part")
+    try:
+        write_tum(part, trajectory)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _nothing_mapped(run: MappingRun, source: FrameSource, span: range) -> InputError | RunError:
+    if run.stopped is not None:
+        return RunError(f"{run.stopped}; nothing was mapped")
+    why = f": {run.fault}" if run.fault is not None else ""
+    return InputError(f"none of the {len(span)} frames of {source.name} could be mapped{why}")
+
+
+def _complain(run: MappingRun, results: Results, out: Path) -> None:
+    """RunError if the run ended early or a result is missing."""
+    why = run.stopped or results.fault
+    if why is not None:
+        kept = ", ".join(results.kept)
+        raise RunError(f"{why}; " + (f"kept in {out}: {kept}" if kept else f"nothing could be kept in {out}"))
+
+
+def _skipped(run: MappingRun, statistics: RunStatistics) -> list[str]:
+    count = statistics.lost.get("frames_skipped", 0)
+    return [f"{count} frames were skipped; the first: {run.fault}"] if count else []

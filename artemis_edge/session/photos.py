@@ -1,0 +1,84 @@
+"""Photographs kept out of the map, written with their poses: PHOTOS.json, for ``evaluate texture``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from artemis_edge.export.atomic import write_bytes
+from artemis_edge.frames import F64, CameraImage, SyncedFrame, Trajectory
+from artemis_edge.trajectory import covered, interpolate, inverse
+
+INDEX = "PHOTOS.json"
+FOLDER = "photos"
+_PNG_MAGIC = b"\x89PNG"
+
+
+@dataclass(frozen=True, slots=True)
+class _Photo:
+    file: str
+    image: CameraImage
+
+
+@dataclass(slots=True)
+class HeldOut:
+    """Takes every ``every``-th image of each camera, in order of time, out of the frames (0: none).
+
+    The photographs are written to ``out`` as they come, so that they need no memory. Raises RunError when
+    they cannot be.
+    """
+
+    out: Path
+    every: int
+    _seen: dict[str, int] = field(default_factory=dict)
+    _photos: list[_Photo] = field(default_factory=list)
+
+    def take(self, frame: SyncedFrame) -> SyncedFrame:
+        """The frame without what is held out."""
+        if self.every == 0 or not frame.images:
+            return frame
+        kept = tuple(image for image in frame.images if not self._takes(image))
+        return replace(frame, images=kept)
+
+    def _takes(self, image: CameraImage) -> bool:
+        number = self._seen.get(image.name, 0) + 1
+        self._seen[image.name] = number
+        if number % self.every:
+            return False
+        suffix = "png" if image.encoded.startswith(_PNG_MAGIC) else "jpg"
+        file = f"{FOLDER}/{image.name}_{number:06d}.{suffix}"
+        (self.out / FOLDER).mkdir(exist_ok=True)
+        write_bytes(self.out / file, image.encoded)
+        self._photos.append(_Photo(file, replace(image, encoded=b"")))
+        return True
+
+    def write_index(self, path: Path, trajectory: Trajectory) -> int:
+        """Write PHOTOS.json; returns how many photographs have no pose and are not in it.
+
+        The pose of a photograph is interpolated at the middle of its exposure.
+        """
+        stamps = np.array([photo.image.stamp_ns for photo in self._photos], np.int64)
+        known = covered(trajectory, stamps)
+        poses = interpolate(trajectory, stamps) if known.any() else np.empty((0, 4, 4))
+        content = [_entry(self._photos[k], poses[k]) for k in np.flatnonzero(known)]
+        write_bytes(path, (json.dumps({"photos": content}, indent=1) + "\n").encode())
+        return int(np.count_nonzero(~known))
+
+
+def _entry(photo: _Photo, T_world_lidar: F64) -> dict[str, Any]:
+    model = photo.image.model
+    T_cam_world: Sequence[Any] = (photo.image.T_cam_lidar @ inverse(T_world_lidar)).tolist()
+    return {
+        "file": photo.file,
+        "fx": model.fx,
+        "fy": model.fy,
+        "cx": model.cx,
+        "cy": model.cy,
+        "distortion": list(model.distortion),
+        "T_cam_world": T_cam_world,
+    }

@@ -1,0 +1,97 @@
+"""The output directory of a run: every file complete under its name, or the one that was there before."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from artemis_edge.errors import InputError, RunError
+from artemis_edge.export.atomic import write_bytes
+
+_T = TypeVar("_T")
+
+
+class Results:
+    """Writes results one by one: where one cannot be written, the others still are.
+
+    ``kept`` are the names written, ``fault`` the first sentence why something was not (None: all well).
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.kept: list[str] = []
+        self.fault: str | None = None
+
+    def attempt(self, name: str, write: Callable[[Path], _T]) -> _T | None:
+        """``write`` the result ``name``; None when that failed, which is remembered."""
+        try:
+            value = write(self.folder / name)
+        except RunError as error:
+            self._failed(str(error))
+        except OSError as error:
+            self._failed(disk_sentence(self.folder / name, error))
+        else:
+            self.kept.append(name)
+            return value
+        return None
+
+    def text(self, name: str, content: str) -> None:
+        """A text file."""
+        self.attempt(name, lambda path: write_bytes(path, content.encode()))
+
+    def json(self, name: str, content: Any) -> None:
+        """A JSON file."""
+        self.text(name, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+
+    def directory(self, name: str, write: Callable[[Path], _T]) -> _T | None:
+        """A folder that ``write`` fills; it takes the place of an older one only when complete."""
+        return self.attempt(name, lambda path: _replace_folder(path, write))
+
+    def _failed(self, sentence: str) -> None:
+        self.fault = self.fault or sentence
+
+
+def disk_sentence(place: Path, error: OSError) -> str:
+    """Why something could not be written, and what to do."""
+    return f"cannot write {place}: {error.strerror or error}; free space or choose another place"
+
+
+def prepare(folder: Path) -> None:
+    """Create ``folder`` for results if it is not there; InputError if it cannot be one."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; --out needs a folder")
+    if not folder.exists() and not folder.resolve().parent.is_dir():
+        raise InputError(f"there is no folder {folder.resolve().parent}; create it or choose another --out")
+    try:
+        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror}; choose another --out") from None
+
+
+@contextmanager
+def scratch(folder: Path) -> Iterator[Path]:
+    """A hidden folder inside ``folder``, on the same disk, gone afterwards."""
+    with tempfile.TemporaryDirectory(prefix=".scratch-", dir=folder, ignore_cleanup_errors=True) as name:
+        yield Path(name)
+
+
+def _replace_folder(path: Path, write: Callable[[Path], _T]) -> _T:
+    part, old = (path.with_name(f".{path.name}.{os.getpid()}.{kind}") for kind in ("part", "old"))
+    try:
+        part.mkdir()
+        value = write(part)
+        if path.exists():
+            path.replace(old)
+        part.replace(path)
+        return value
+    finally:
+        for leftover in (part, old):
+            shutil.rmtree(leftover, ignore_errors=True)
