@@ -72,11 +72,16 @@ def _measured(found: dict[str, Any], length_m: float) -> list[tuple[str, str]]:
             "mesh within 10 cm",
             f"F1 {scores['f1']:.3f} (precision {scores['precision']:.3f}, recall {scores['recall']:.3f})",
         ),
-        ("wound as the world", f"{world['wound_share']:.2%} of the triangles"),
-        ("bridging a gap", f"{world['bridging_area_share']:.2%} of the area"),
+        ("wound as the world", f"{_percent(world['wound_share'])} of the triangles"),
+        ("bridging a gap", f"{_percent(world['bridging_area_share'])} of the area"),
         ("edges", f"{edges['non_manifold_share']:.2%} non-manifold, {edges['boundary_share']:.2%} boundary"),
         ("path", f"{path['ate_rmse_m'] * 100:.1f} cm rms off over {length_m:.1f} m"),
     ]
+
+
+def _percent(share: float | None) -> str:
+    """``None`` where nothing could be judged."""
+    return "none judged" if share is None else f"{share:.2%}"
 
 
 def _cost(report: dict[str, Any]) -> list[tuple[str, str]]:

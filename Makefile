@@ -1,0 +1,51 @@
+# Everything lives in .venv of this checkout; nothing else on the machine is touched.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+OUT    ?= demo-out
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help setup demo test lint bench soak clean
+
+help:
+	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
+	@echo "make test    the tests (those on real recordings need ARTEMIS_DATA)"
+	@echo "make lint    ruff and mypy"
+	@echo "make bench   what a frame costs on this machine"
+	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
+	@echo "make setup   only create $(VENV); every target does it when needed"
+	@echo "make clean   remove $(VENV) and everything that was generated"
+
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or newer is needed; name one with: make PYTHON=python3.12"; exit 2; }
+	@echo "setting up $(VENV) (once; a minute or two)"
+	@$(PYTHON) -m venv $(VENV) || \
+	  { echo "python3 -m venv does not work here; on Debian and Ubuntu: apt install python3-venv"; exit 2; }
+	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --only-binary :all: -e '.[dev]'
+	@touch $@
+	@echo "ready: $(BIN)/artemis-edge"
+
+demo: $(READY)
+	@$(BIN)/artemis-edge demo --out $(OUT)
+
+test: $(READY)
+	@$(BIN)/python -m pytest
+
+lint: $(READY)
+	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/mypy --no-error-summary
+	@echo "ruff and mypy: nothing to complain about"
+
+bench: $(READY)
+	@$(BIN)/artemis-edge bench
+
+soak: $(READY)
+	@$(BIN)/python tests/soak/walk.py
+
+clean:
+	@rm -rf $(VENV) $(OUT) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
