@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_edge._jit import njit
+from artemis_edge._jit import kernel
 from artemis_edge.frames import F32, I32, I64, U8
 
 CELLS_PER_VOXEL = 4  # along an edge: 64 cells are one uint64 mask
@@ -28,11 +28,14 @@ COUNT, SUM, SQUARE, VIEW, THROUGH, CONFIRMED = 0, 1, 4, 10, 13, 14
 # Columns of Store.vertex
 POSITION, NORMAL, ROUGHNESS = 0, 3, 6
 # Columns of Store.voxel
-IX, IY, IZ, BLOCK, PENDING, SINCE, PATCH_AT, PATCH_LEN, PATCH_ROOM, TOUCHED = range(10)
+# PENDING: hits since the last meshing; FRESH: new vertices since then; AT_MESH: hits the last meshing knew;
+# QUEUED: stamp at which it began to wait for meshing, 0 when it does not
+IX, IY, IZ, BLOCK, PENDING, FRESH, AT_MESH, PATCH_AT, PATCH_LEN, PATCH_ROOM, TOUCHED, QUEUED = range(12)
 # Columns of Store.block
 BX, BY, BZ, SEEN, CHANGED = range(5)
 # Slots of Store.counter
-N_BLOCKS, N_VOXELS, N_CELLS, N_TRIANGLES, FREE_BLOCKS, FREE_VOXELS, FREE_CELLS, N_VERTICES = range(8)
+N_BLOCKS, N_VOXELS, N_CELLS, N_TRIANGLES, FREE_BLOCKS, FREE_VOXELS, FREE_CELLS = range(7)
+QUEUE_AT, QUEUE_LEN, REFUSED_POINTS, CARVED_CELLS, TOUCHED_BLOCKS = range(7, 12)
 
 # Store.state: what a cell's vertex is
 EVIDENCE_ONLY, ALIVE, CARVED = 0, 1, 2
@@ -48,14 +51,16 @@ class Store(NamedTuple):
     hash_slot: I32  # (h,)
     block: I32  # (b, 5)
     block_voxel: I32  # (b, 512) voxel slot or -1
-    voxel: I32  # (v, 10)
+    touched_block: I32  # (b,) blocks that received points in this frame
+    voxel: I32  # (v, 12)
     voxel_mask: NDArray[np.uint64]  # (v,) which cells hold evidence
     voxel_cell: I32  # (v, 64) cell slot or -1
     evidence: F32  # (c, 16) one cache line
     vertex: F32  # (c, 8)
     state: U8  # (c,)
     triangle: NDArray[np.uint16]  # (t, 3) cell codes relative to the owning voxel
-    counter: I64  # (8,)
+    queue: I32  # (v,) ring of voxels that wait for meshing
+    counter: I64  # (12,)
     free_block: I32
     free_voxel: I32
     free_cell: I32
@@ -69,7 +74,7 @@ def bytes_per_voxel(cells_per_voxel: float = 10.0, triangles_per_voxel: float = 
     Ten cells and 24 triangle slots a voxel are what street and hall recordings fill (docs/tuning.md).
     """
     cell = 16 * 4 + 8 * 4 + 1 + 4
-    return 64 * 4 + 10 * 4 + 8 + 4 + PATCH_CLASSES * 4 + cells_per_voxel * cell + triangles_per_voxel * 6
+    return 64 * 4 + 12 * 4 + 8 + 4 + 4 + PATCH_CLASSES * 4 + cells_per_voxel * cell + triangles_per_voxel * 6
 
 
 def allocate(budget_bytes: float) -> Store:
@@ -82,14 +87,16 @@ def allocate(budget_bytes: float) -> Store:
         hash_slot=np.zeros(slots, np.int32),
         block=np.empty((blocks, 5), np.int32),
         block_voxel=np.empty((blocks, 512), np.int32),
-        voxel=np.empty((voxels, 10), np.int32),
+        touched_block=np.empty(blocks, np.int32),
+        voxel=np.empty((voxels, 12), np.int32),
         voxel_mask=np.empty(voxels, np.uint64),
         voxel_cell=np.empty((voxels, 64), np.int32),
         evidence=np.empty((cells, 16), np.float32),
         vertex=np.empty((cells, 8), np.float32),
         state=np.empty(cells, np.uint8),
         triangle=np.empty((triangles, 3), np.uint16),
-        counter=np.zeros(8, np.int64),
+        queue=np.empty(voxels, np.int32),
+        counter=np.zeros(12, np.int64),
         free_block=np.empty(blocks, np.int32),
         free_voxel=np.empty(voxels, np.int32),
         free_cell=np.empty(cells, np.int32),
@@ -98,7 +105,7 @@ def allocate(budget_bytes: float) -> Store:
     )
 
 
-@njit
+@kernel
 def block_key(bx: int, by: int, bz: int) -> int:
     """Key of a block: 21 bits an axis, enough for 3,000 km of 3.2 m blocks."""
     return (
@@ -106,18 +113,23 @@ def block_key(bx: int, by: int, bz: int) -> int:
     )
 
 
-@njit
+@kernel
+def home_slot(key: int, mask: int) -> int:
+    """Where a key would like to be; Fibonacci hashing spreads keys that differ in few bits."""
+    return np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask
+
+
+@kernel
 def find_slot(hash_key: I64, key: int) -> int:
     """Place of ``key`` in the hash, or the empty place where it would go (linear probing)."""
     mask = hash_key.shape[0] - 1
-    # Fibonacci hashing: the golden ratio spreads keys that differ in few bits
-    at = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask
+    at = home_slot(key, mask)
     while hash_key[at] != EMPTY_KEY and hash_key[at] != key:
         at = (at + 1) & mask
     return at
 
 
-@njit
+@kernel
 def find_block(store: Store, bx: int, by: int, bz: int) -> int:
     """Slot of a resident block or -1."""
     key = block_key(bx, by, bz)
@@ -125,7 +137,7 @@ def find_block(store: Store, bx: int, by: int, bz: int) -> int:
     return store.hash_slot[at] if store.hash_key[at] == key else -1
 
 
-@njit
+@kernel
 def find_or_add_block(store: Store, bx: int, by: int, bz: int) -> int:
     """Slot of a block, made resident and empty if it was not; -1 when the pool is full."""
     key = block_key(bx, by, bz)
@@ -146,7 +158,7 @@ def find_or_add_block(store: Store, bx: int, by: int, bz: int) -> int:
     return slot
 
 
-@njit
+@kernel
 def add_voxel(store: Store, block: int, inner: int, x: int, y: int, z: int) -> int:
     """A fresh voxel at place ``inner`` of a block; -1 when the pool is full."""
     v = _take(store.counter, store.free_voxel, FREE_VOXELS, N_VOXELS, store.voxel.shape[0])
@@ -158,13 +170,12 @@ def add_voxel(store: Store, block: int, inner: int, x: int, y: int, z: int) -> i
     store.voxel[v, IY] = y
     store.voxel[v, IZ] = z
     store.voxel[v, BLOCK] = block
-    store.voxel[v, SINCE] = -1
     store.voxel_mask[v] = 0
     store.voxel_cell[v, :] = -1
     return v
 
 
-@njit
+@kernel
 def add_cell(store: Store, v: int, c: int) -> int:
     """A fresh cell ``c`` of voxel ``v`` without evidence; -1 when the pool is full."""
     s = _take(store.counter, store.free_cell, FREE_CELLS, N_CELLS, store.evidence.shape[0])
@@ -178,13 +189,13 @@ def add_cell(store: Store, v: int, c: int) -> int:
     return s
 
 
-@njit
+@kernel
 def inner_index(x: int, y: int, z: int) -> int:
     """Place of a voxel in its block."""
     return ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
 
 
-@njit
+@kernel
 def _take(counter: I64, free: I32, free_count: int, used: int, room: int) -> int:
     if counter[free_count] > 0:
         counter[free_count] -= 1
@@ -195,7 +206,7 @@ def _take(counter: I64, free: I32, free_count: int, used: int, room: int) -> int
     return counter[used] - 1
 
 
-@njit
+@kernel
 def neighbours27(store: Store, v: int, out: I32) -> None:
     """Slots of the 3 x 3 x 3 voxels around ``v`` (x slowest, z fastest; itself at 13), -1 where none."""
     x, y, z = store.voxel[v, IX], store.voxel[v, IY], store.voxel[v, IZ]
@@ -214,7 +225,7 @@ def neighbours27(store: Store, v: int, out: I32) -> None:
                 k += 1
 
 
-@njit
+@kernel
 def set_patch(store: Store, v: int, buffer: NDArray[np.uint16], n: int) -> bool:
     """Replace the triangles of a voxel; False (nothing changed) when the triangle pool is full."""
     room = store.voxel[v, PATCH_ROOM]
@@ -236,7 +247,7 @@ def set_patch(store: Store, v: int, buffer: NDArray[np.uint16], n: int) -> bool:
     return True
 
 
-@njit
+@kernel
 def _take_patch(store: Store, grade: int) -> int:
     if store.free_patches[grade] > 0:
         store.free_patches[grade] -= 1
@@ -248,7 +259,7 @@ def _take_patch(store: Store, grade: int) -> int:
     return at
 
 
-@njit
+@kernel
 def release_patch(store: Store, v: int) -> None:
     """Give the triangles of a voxel back to the pool."""
     room = store.voxel[v, PATCH_ROOM]
@@ -260,3 +271,64 @@ def release_patch(store: Store, v: int) -> None:
         store.free_patches[grade] += 1
     store.voxel[v, PATCH_ROOM] = 0
     store.voxel[v, PATCH_LEN] = 0
+
+
+@kernel
+def enqueue(store: Store, v: int, stamp: int) -> None:
+    """Let a voxel wait for meshing, once."""
+    if store.voxel[v, QUEUED] == 0:
+        store.voxel[v, QUEUED] = stamp
+        room = store.queue.shape[0]
+        store.queue[(store.counter[QUEUE_AT] + store.counter[QUEUE_LEN]) % room] = v
+        store.counter[QUEUE_LEN] += 1
+
+
+@kernel
+def dequeue(store: Store) -> int:
+    """The voxel that waits longest, taken off the queue (its QUEUED stamp is left for the caller)."""
+    v = store.queue[store.counter[QUEUE_AT]]
+    store.counter[QUEUE_AT] = (store.counter[QUEUE_AT] + 1) % store.queue.shape[0]
+    store.counter[QUEUE_LEN] -= 1
+    return v
+
+
+@kernel
+def remove_block(store: Store, block: int) -> None:
+    """Forget a block and give its memory back. None of its voxels may wait in the queue."""
+    for inner in range(512):
+        v = store.block_voxel[block, inner]
+        if v < 0:
+            continue
+        release_patch(store, v)
+        for c in range(64):
+            s = store.voxel_cell[v, c]
+            if s >= 0:
+                store.free_cell[store.counter[FREE_CELLS]] = s
+                store.counter[FREE_CELLS] += 1
+        store.free_voxel[store.counter[FREE_VOXELS]] = v
+        store.counter[FREE_VOXELS] += 1
+    row = store.block[block]
+    _remove_key(store.hash_key, store.hash_slot, find_slot(store.hash_key, block_key(row[BX], row[BY], row[BZ])))
+    store.block[block, SEEN] = -1
+    store.free_block[store.counter[FREE_BLOCKS]] = block
+    store.counter[FREE_BLOCKS] += 1
+
+
+@kernel
+def _remove_key(hash_key: I64, hash_slot: I32, hole: int) -> None:
+    """Empty a place and move later keys of the run back (Knuth 6.4, algorithm R)."""
+    mask = hash_key.shape[0] - 1
+    at = hole
+    while True:
+        hash_key[hole] = EMPTY_KEY
+        while True:
+            at = (at + 1) & mask
+            key = hash_key[at]
+            if key == EMPTY_KEY:
+                return
+            home = home_slot(key, mask)
+            if ((at - home) & mask) >= ((at - hole) & mask):
+                break
+        hash_key[hole] = hash_key[at]
+        hash_slot[hole] = hash_slot[at]
+        hole = at

@@ -8,39 +8,39 @@ from __future__ import annotations
 
 import numpy as np
 
-from artemis_edge._jit import njit
+from artemis_edge._jit import kernel
 from artemis_edge.block_store import Store
 from artemis_edge.frames import I32
 
-CODES = 1 << 15
+CODES = 1 << 15  # the 16th bit of a stored code is the mesher's
 OWN = 12  # first own coordinate
 
 
-@njit
+@kernel
 def code_of(X: int, Y: int, Z: int) -> int:
     """Code of biased coordinates."""
     return (X << 10) | (Y << 5) | Z
 
 
-@njit
+@kernel
 def neighbour_shift(k: int) -> int:
     """What to add to a code of neighbour ``k`` (0..26 as in ``neighbours27``) to express it in the own frame."""
     return ((k // 9 - 1) * 4 << 10) + (((k // 3) % 3 - 1) * 4 << 5) + (k % 3 - 1) * 4
 
 
-@njit
+@kernel
 def code_voxel(code: int) -> int:
     """Which of the 27 voxels a code lies in."""
     return (((code >> 10) - 8) >> 2) * 9 + ((((code >> 5) & 31) - 8) >> 2) * 3 + (((code & 31) - 8) >> 2)
 
 
-@njit
+@kernel
 def code_cell(code: int) -> int:
     """Cell 0..63 within its voxel."""
     return (((code >> 10) & 3) << 4) | (((code >> 5) & 3) << 2) | (code & 3)
 
 
-@njit
+@kernel
 def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32) -> int:
     """Cells with evidence of a voxel (first) and within ``margin`` cells around it.
 
@@ -53,7 +53,7 @@ def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32
     return n
 
 
-@njit
+@kernel
 def gather_voxel(store: Store, w: int, k: int, margin: int, grid: I32, code: I32, n: int) -> int:
     """The part of ``gather_cells`` for one of the 27 voxels."""
     lo, hi = OWN - margin, OWN + 4 + margin

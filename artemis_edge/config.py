@@ -88,6 +88,15 @@ class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
         float,
         _float("Thickness up to which points are one plane: ranging noise 1 sigma [m].", gt=0.0, le=0.5),
     ] = 0.02
+    free_space: Annotated[
+        bool, Meta(description="Whether vertices that later scans look through are removed.")
+    ] = True
+    free_space_range_m: Annotated[
+        float, _float("How far around the sensor vertices are judged by free space [m].", gt=0.0, le=200.0)
+    ] = 30.0
+    free_space_slope: Annotated[
+        float, _float("Share of the range by which a look must miss a vertex, besides a voxel.", ge=0.0, le=0.2)
+    ] = 0.02
     memory_budget_mb: Annotated[
         int,
         Meta(description="Resident memory of the whole process; beyond it blocks go to disk [MB].", ge=600),
@@ -100,6 +109,42 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     min_distance: Annotated[
         float, _float("Vertices nearer than this share of the point spacing are merged.", ge=0.0, le=1.0)
     ] = 0.6
+    short_edge: Annotated[
+        float, _float("Edges up to this many point spacings are surface.", ge=1.0, le=4.0)
+    ] = 2.0
+    long_edge: Annotated[
+        float,
+        _float("Edges up to this many point spacings are surface where seen well or flat.", ge=1.0, le=4.0),
+    ] = 4.0
+    well_seen: Annotated[
+        float, _float("Evidence (hits at close range) of a vertex that carries a long edge.", gt=0.0)
+    ] = 1.5
+    coplanar: Annotated[
+        float,
+        _float("Or the cosine between a triangle's normal and its vertices' normals that does.", ge=0.0, le=1.1),
+    ] = 0.9
+    agreement: Annotated[
+        float, _float("Least such cosine of any triangle; -1 accepts all.", ge=-1.0, le=1.0)
+    ] = -1.0
+    group_cosine: Annotated[
+        float,
+        _float("Vertices whose normal is this near to a voxel's direction are meshed together.", ge=-1.0, le=1.0),
+    ] = 0.3
+    wait_frames: Annotated[
+        int, Meta(description="Frames a voxel collects evidence before its first patch.", ge=0, le=100)
+    ] = 3
+    longest_wait_frames: Annotated[
+        int, Meta(description="Frames after which a waiting voxel is meshed or let go.", ge=1, le=1000)
+    ] = 20
+    growth: Annotated[
+        float, _float("A patch is made anew when its evidence grew by this factor (3: noise halves).", gt=0.0)
+    ] = 3.0
+    most_voxels: Annotated[
+        int, Meta(description="Voxels meshed in one frame at most; the rest waits.", ge=1)
+    ] = 1500
+    smallest_island: Annotated[
+        int, Meta(description="Islands of fewer triangles are left out of the finished mesh.", ge=1)
+    ] = 10
 
 
 class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):

@@ -7,19 +7,19 @@ the containing triangle short.
 
 from __future__ import annotations
 
-from artemis_edge._jit import njit
+from artemis_edge._jit import kernel
 from artemis_edge.frames import F64, I32
 
 # Corners of the triangle that encloses everything, in units of the coordinates (voxels are below 10 m)
 _FAR = 1.0e3
 
 
-@njit
+@kernel
 def _left_of(x: F64, y: F64, a: int, b: int, p: int) -> float:
     return (x[b] - x[a]) * (y[p] - y[a]) - (y[b] - y[a]) * (x[p] - x[a])
 
 
-@njit
+@kernel
 def in_circle(x: F64, y: F64, a: int, b: int, c: int, p: int) -> bool:
     """True when p is surely inside the circle through a, b, c (counter-clockwise).
 
@@ -39,7 +39,7 @@ def in_circle(x: F64, y: F64, a: int, b: int, c: int, p: int) -> bool:
     return det > 1.2e-15 * permanent
 
 
-@njit
+@kernel
 def _replace(link: I32, triangle: int, old: int, new: int) -> None:
     if triangle >= 0:
         for k in range(3):
@@ -47,7 +47,7 @@ def _replace(link: I32, triangle: int, old: int, new: int) -> None:
                 link[triangle, k] = new
 
 
-@njit
+@kernel
 def _walk(x: F64, y: F64, corner: I32, link: I32, t: int, p: int, limit: int) -> int:
     for _ in range(limit):
         a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
@@ -62,7 +62,7 @@ def _walk(x: F64, y: F64, corner: I32, link: I32, t: int, p: int, limit: int) ->
     return t
 
 
-@njit
+@kernel
 def _split(corner: I32, link: I32, t: int, p: int, n: int) -> None:
     """Triangle t becomes (a, b, p), (b, c, p), (c, a, p) at t, n, n + 1: p is always corner 2."""
     a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
@@ -77,7 +77,7 @@ def _split(corner: I32, link: I32, t: int, p: int, n: int) -> None:
     _replace(link, over_b, t, n + 1)
 
 
-@njit
+@kernel
 def _flip(corner: I32, link: I32, s: int, o: int, k: int) -> None:
     """Exchange the edge a-b of s = (a, b, p) and o (d at corner k) for the edge d-p."""
     b, p, d = corner[s, 1], corner[s, 2], corner[o, k]
@@ -90,7 +90,7 @@ def _flip(corner: I32, link: I32, s: int, o: int, k: int) -> None:
     _replace(link, beyond_bp, s, o)
 
 
-@njit
+@kernel
 def delaunay(x: F64, y: F64, n: int, corner: I32, link: I32, stack: I32) -> int:
     """Triangulate points 0..n-1; ``x`` and ``y`` float64 with room for n + 3.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from artemis_edge._jit import njit
+from artemis_edge._jit import kernel
 from artemis_edge.frames import F64
 
 
-@njit
+@kernel
 def smallest_eigen3(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, out: F64
 ) -> None:

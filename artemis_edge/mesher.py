@@ -15,15 +15,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from artemis_edge import block_store as bs
-from artemis_edge._jit import njit
-from artemis_edge.block_store import ALIVE, COUNT, NORMAL, PATCH_AT, PATCH_LEN, POSITION, Store
+from artemis_edge._jit import kernel
+from artemis_edge.block_store import (
+    ALIVE,
+    AT_MESH,
+    BLOCK,
+    CELLS_PER_VOXEL,
+    CHANGED,
+    COUNT,
+    FRESH,
+    NORMAL,
+    PATCH_AT,
+    PATCH_LEN,
+    PENDING,
+    POSITION,
+    QUEUE_LEN,
+    QUEUED,
+    Store,
+)
 from artemis_edge.cell_code import CODES, gather_cells, neighbour_shift
+from artemis_edge.config import MesherConfig
 from artemis_edge.delaunay import delaunay
 from artemis_edge.frames import F64, I32, U8
+from artemis_edge.voxel_map import VoxelMap, refresh_voxel
 
-MARGIN_CELLS = 2  # neighbours' vertices within half a voxel take part (measured: half of it, 2.8 x the conflicts)
+# Neighbours' vertices one cell around take part. Two cells halve the edges that neighbours disagree about, but cost
+# 60 % more and score no better, because ears close what is left (docs/tuning.md)
+MARGIN_CELLS = 1
 MOST_VERTICES = 192  # a voxel and its margin; more (dense foliage) are left out, nearest first
 MOST_TRIANGLES = 512
+MOST_GROUPS = 2  # a voxel may hold both sides of a thin wall
+EAR = 1 << 15  # flag in the first code of a triangle that only fills a gap
 
 
 class Rules(NamedTuple):
@@ -32,7 +54,8 @@ class Rules(NamedTuple):
     short_edge_m: float  # always accepted up to this length
     long_edge_m: float  # accepted up to this length between well-seen vertices
     well_seen: float  # evidence that makes a vertex well seen
-    agreement: float  # least cosine between a triangle's normal and those of its vertices
+    coplanar: float  # cosine between a triangle's normal and those of its vertices that makes up for evidence
+    agreement: float  # least such cosine for any triangle
     group_cosine: float  # vertices whose normal is nearer than this to the direction are meshed together
 
 
@@ -58,9 +81,13 @@ class Workspace(NamedTuple):
     corner: I32  # (2 m + 1, 3)
     link: I32
     stack: I32
+    hole: I32  # (e, 3) free edges: start, end, next of the same start
+    hole_of: I32  # (m,) first free edge of a vertex
+    ear: I32  # (27 MOST_TRIANGLES, 5) neighbours' ears: voxel slot, index, local corners
     triangles: I32  # (MOST_TRIANGLES, 3) local indices
     patch: NDArray[np.uint16]  # (MOST_TRIANGLES, 3) codes
     frame: F64  # (3, 3) rows: first axis, second axis, direction
+    direction: F64  # (MOST_GROUPS, 3)
     eigen: F64  # (6,)
     tally: NDArray[np.int64]  # (8,) 0 voxels, 1 vertices, 2 accepted, 3 edge taken, 4 too long, 5 normals, 6 ears
 
@@ -88,35 +115,37 @@ def workspace() -> Workspace:
         corner=np.empty((2 * m + 1, 3), np.int32),
         link=np.empty((2 * m + 1, 3), np.int32),
         stack=np.empty(8 * m, np.int32),
+        hole=np.empty((27 * MOST_TRIANGLES, 3), np.int32),
+        hole_of=np.empty(m, np.int32),
+        ear=np.empty((27 * MOST_TRIANGLES, 5), np.int32),
         triangles=np.empty((MOST_TRIANGLES, 3), np.int32),
         patch=np.empty((MOST_TRIANGLES, 3), np.uint16),
         frame=np.empty((3, 3)),
+        direction=np.empty((MOST_GROUPS, 3)),
         eigen=np.empty(6),
         tally=np.zeros(8, np.int64),
     )
 
 
-@njit
+@kernel
 def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace) -> bool:
     """Replace the patch of voxel ``v``; False when the triangle pool is full."""
     bs.neighbours27(store, v, w.neighbour)
     cells = gather_cells(store, w.neighbour, MARGIN_CELLS, w.grid, w.code)
     n = collect_vertices(store, v, cells, voxel_m, w)
-    triangles = 0
+    triangles = plain = 0
     if n >= 3:
-        edges = take_neighbour_edges(store, n, w)
-        for _ in range(2):  # a voxel may hold both sides of a thin wall
-            if not _direction(n, rules.group_cosine, w):
-                break
-            before = triangles
+        edges, ears = take_neighbour_edges(store, w)
+        groups = 0
+        while groups < MOST_GROUPS and _direction(n, w):
             triangles, edges = _mesh_group(n, voxel_m, rules, w, triangles, edges)
-            for _ in range(3):
-                filled = triangles
-                triangles, edges = _fill_ears(n, rules, w, triangles, edges)
-                if triangles == filled:
-                    break
-            if triangles == before:
-                break
+            for k in range(3):
+                w.direction[groups, k] = w.frame[2, k]
+            groups += 1
+        plain = triangles
+        edges = _settle_ears(store, ears, w, edges)
+        for g in range(groups):
+            triangles, edges = _fill_ears(n, w.direction[g], rules, w, triangles, edges)
         for i in range(edges):
             w.edge[w.edges[i, 0], w.edges[i, 1]] = 0
     for i in range(cells):
@@ -124,13 +153,15 @@ def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace)
     for i in range(triangles):
         for k in range(3):
             w.patch[i, k] = w.local_code[w.triangles[i, k]]
+        if i >= plain:
+            w.patch[i, 0] |= EAR
     w.tally[0] += 1
     w.tally[1] += n
     w.tally[2] += triangles
     return bs.set_patch(store, v, w.patch, triangles)
 
 
-@njit
+@kernel
 def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Workspace) -> int:
     """Living vertices of the voxel and its margin, positions relative to the voxel's corner.
 
@@ -162,10 +193,14 @@ def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Worksp
     return n
 
 
-@njit
-def take_neighbour_edges(store: Store, n: int, w: Workspace) -> int:
-    """Mark the directed edges that the 26 neighbours' patches use between local vertices; returns how many."""
-    edges = 0
+@kernel
+def take_neighbour_edges(store: Store, w: Workspace) -> tuple[int, int]:
+    """Mark the directed edges that the neighbours' patches use between local vertices; list their ears.
+
+    Returns (edges, ears). Ears only fill what was left over, so they are listed and not marked: a triangle of
+    this voxel's own triangulation may displace them.
+    """
+    edges = ears = 0
     for k in range(27):
         u = w.neighbour[k]
         if k == 13 or u < 0:
@@ -173,19 +208,58 @@ def take_neighbour_edges(store: Store, n: int, w: Workspace) -> int:
         shift = neighbour_shift(k)
         at = store.voxel[u, PATCH_AT]
         for t in range(at, at + store.voxel[u, PATCH_LEN]):
-            a = w.grid[np.int64(store.triangle[t, 0]) + shift]
+            first = np.int64(store.triangle[t, 0])
+            a = w.grid[(first & ~EAR) + shift]
             b = w.grid[np.int64(store.triangle[t, 1]) + shift]
             c = w.grid[np.int64(store.triangle[t, 2]) + shift]
-            if a >= 0 and b >= 0:
-                edges = _use_edge(w, a, b, edges)
-            if b >= 0 and c >= 0:
-                edges = _use_edge(w, b, c, edges)
-            if c >= 0 and a >= 0:
-                edges = _use_edge(w, c, a, edges)
+            if (a < 0) + (b < 0) + (c < 0) > 1:
+                continue
+            if first & EAR:
+                e = w.ear[ears]
+                e[0], e[1], e[2], e[3], e[4] = u, t - at, a, b, c
+                ears += 1
+                continue
+            edges = _use_edges(w, a, b, c, edges)
+    return edges, ears
+
+
+@kernel
+def _use_edges(w: Workspace, a: int, b: int, c: int, edges: int) -> int:
+    if a >= 0 and b >= 0:
+        edges = _use_edge(w, a, b, edges)
+    if b >= 0 and c >= 0:
+        edges = _use_edge(w, b, c, edges)
+    if c >= 0 and a >= 0:
+        edges = _use_edge(w, c, a, edges)
     return edges
 
 
-@njit
+@kernel
+def _settle_ears(store: Store, ears: int, w: Workspace, edges: int) -> int:
+    """Neighbours' ears whose edges this voxel now uses are removed from their patches; the others are marked.
+
+    From the last to the first, so that moving a patch's last triangle into a gap keeps the listed places valid.
+    """
+    for i in range(ears - 1, -1, -1):
+        u, t, a, b, c = w.ear[i]
+        taken = (
+            (a >= 0 and b >= 0 and w.edge[a, b] == 1)
+            or (b >= 0 and c >= 0 and w.edge[b, c] == 1)
+            or (c >= 0 and a >= 0 and w.edge[c, a] == 1)
+        )
+        if taken:
+            store.voxel[u, PATCH_LEN] -= 1
+            at = store.voxel[u, PATCH_AT]
+            last = at + store.voxel[u, PATCH_LEN]
+            for k in range(3):
+                store.triangle[at + t, k] = store.triangle[last, k]
+            w.tally[7] += 1
+        else:
+            edges = _use_edges(w, a, b, c, edges)
+    return edges
+
+
+@kernel
 def _use_edge(w: Workspace, a: int, b: int, edges: int) -> int:
     if w.edge[a, b] == 0:
         w.edge[a, b] = 1
@@ -195,8 +269,8 @@ def _use_edge(w: Workspace, a: int, b: int, edges: int) -> int:
     return edges
 
 
-@njit
-def _direction(n: int, group_cosine: float, w: Workspace) -> bool:
+@kernel
+def _direction(n: int, w: Workspace) -> bool:
     """Projection frame for the own vertices not meshed yet: their mean normal, to the nearest of 26 directions.
 
     Quantised so that neighbours project the same way (measured: a third of the conflicts). False: nothing left.
@@ -232,7 +306,7 @@ def _direction(n: int, group_cosine: float, w: Workspace) -> bool:
     return True
 
 
-@njit
+@kernel
 def _select(n: int, group_cosine: float, w: Workspace) -> int:
     """Local vertices of the group, projected and sorted along a snake; returns how many."""
     u, t, d = w.frame[0], w.frame[1], w.frame[2]
@@ -263,7 +337,7 @@ def _select(n: int, group_cosine: float, w: Workspace) -> int:
     return m
 
 
-@njit
+@kernel
 def _mesh_group(n: int, voxel_m: float, rules: Rules, w: Workspace, triangles: int, edges: int) -> tuple[int, int]:
     """Delaunay of one group; accepted own triangles are appended. Returns (triangles, edges)."""
     m = _select(n, rules.group_cosine, w)
@@ -285,7 +359,7 @@ def _mesh_group(n: int, voxel_m: float, rules: Rules, w: Workspace, triangles: i
     return triangles, edges
 
 
-@njit
+@kernel
 def _accept(a: int, b: int, c: int, w: Workspace, triangles: int, edges: int) -> tuple[int, int]:
     if triangles == MOST_TRIANGLES:
         return triangles, edges
@@ -296,7 +370,7 @@ def _accept(a: int, b: int, c: int, w: Workspace, triangles: int, edges: int) ->
     return triangles + 1, edges
 
 
-@njit
+@kernel
 def _is_owned(a: int, b: int, c: int, voxel_m: float, position: F64) -> bool:
     for k in range(3):
         middle = (position[a, k] + position[b, k] + position[c, k]) / 3.0
@@ -305,19 +379,17 @@ def _is_owned(a: int, b: int, c: int, voxel_m: float, position: F64) -> bool:
     return True
 
 
-@njit
+@kernel
 def _edge2(position: F64, a: int, b: int) -> float:
     dx, dy, dz = position[a, 0] - position[b, 0], position[a, 1] - position[b, 1], position[a, 2] - position[b, 2]
     return dx * dx + dy * dy + dz * dz
 
 
-@njit
+@kernel
 def is_surface(a: int, b: int, c: int, rules: Rules, w: Workspace) -> bool:
     """Whether a triangle is surface: its edges against its evidence, its normal against its vertices'."""
     longest = max(_edge2(w.position, a, b), _edge2(w.position, b, c), _edge2(w.position, c, a))
-    least = min(w.evidence[a], w.evidence[b], w.evidence[c])
-    limit = rules.long_edge_m if least >= rules.well_seen else rules.short_edge_m
-    if longest > limit * limit:
+    if longest > rules.long_edge_m * rules.long_edge_m:
         w.tally[4] += 1
         return False
     p, q, r = w.position[a], w.position[b], w.position[c]
@@ -327,46 +399,63 @@ def is_surface(a: int, b: int, c: int, rules: Rules, w: Workspace) -> bool:
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     if length < 1e-12:
         return False
+    agreement = 1.0
     for i in (a, b, c):
         g = w.normal[i]
-        if nx * g[0] + ny * g[1] + nz * g[2] < rules.agreement * length:
-            w.tally[5] += 1
+        agreement = min(agreement, (nx * g[0] + ny * g[1] + nz * g[2]) / length)
+    if agreement < rules.agreement:
+        w.tally[5] += 1
+        return False
+    if longest > rules.short_edge_m * rules.short_edge_m:
+        least = min(w.evidence[a], w.evidence[b], w.evidence[c])
+        if least < rules.well_seen and agreement < rules.coplanar:
+            w.tally[4] += 1
             return False
     return True
 
 
-@njit
-def _fill_ears(n: int, rules: Rules, w: Workspace, triangles: int, edges: int) -> tuple[int, int]:
+@kernel
+def _fill_ears(n: int, d: F64, rules: Rules, w: Workspace, triangles: int, edges: int) -> tuple[int, int]:
     """Close notches and small holes: two free edges b-a, a-x in a row get the triangle (b, a, x).
 
     Such gaps stay where neighbours disagreed about an edge. The new triangle must be surface by the same rules,
     turn the same way and hold no vertex; at least one corner is the voxel's own.
     """
-    known = edges
-    d = w.frame[2]
-    for i in range(known):
+    for i in range(n):
+        w.hole_of[i] = -1
+    holes = 0
+    for i in range(edges):
         a, b = w.edges[i, 0], w.edges[i, 1]
-        if w.edge[b, a]:
-            continue
-        for j in range(known):
-            if w.edges[j, 1] != a:
-                continue
-            x = w.edges[j, 0]
-            if x == b or w.edge[a, x] or w.edge[b, a] or w.edge[x, b]:
-                continue
-            if not (w.own[a] or w.own[b] or w.own[x]):
+        if w.edge[b, a] == 0:
+            holes = _add_hole(w, b, a, holes)
+    i = 0
+    while i < holes:  # the list grows while ears are added
+        b, a = w.hole[i, 0], w.hole[i, 1]
+        i += 1
+        j = w.hole_of[a]
+        while j >= 0 and w.edge[b, a] == 0:
+            x = w.hole[j, 1]
+            j = w.hole[j, 2]
+            if x == b or w.edge[a, x] or w.edge[x, b] or not (w.own[a] or w.own[b] or w.own[x]):
                 continue
             if _turn(b, a, x, d, w.position) <= 0.0 or not is_surface(b, a, x, rules, w):
                 continue
-            if not _is_empty(b, a, x, n, d, w.position):
-                continue
-            triangles, edges = _accept(b, a, x, w, triangles, edges)
-            w.tally[6] += 1
-            break
+            if _is_empty(b, a, x, n, d, w.position):
+                triangles, edges = _accept(b, a, x, w, triangles, edges)
+                w.tally[6] += 1
+                if w.edge[b, x] == 0:
+                    holes = _add_hole(w, b, x, holes)
     return triangles, edges
 
 
-@njit
+@kernel
+def _add_hole(w: Workspace, start: int, end: int, holes: int) -> int:
+    w.hole[holes, 0], w.hole[holes, 1], w.hole[holes, 2] = start, end, w.hole_of[start]
+    w.hole_of[start] = holes
+    return holes + 1
+
+
+@kernel
 def _turn(a: int, b: int, c: int, d: F64, position: F64) -> float:
     """Twice the area of a, b, c seen along -d; positive when counter-clockwise."""
     p, q, r = position[a], position[b], position[c]
@@ -375,7 +464,7 @@ def _turn(a: int, b: int, c: int, d: F64, position: F64) -> float:
     return (uy * vz - uz * vy) * d[0] + (uz * vx - ux * vz) * d[1] + (ux * vy - uy * vx) * d[2]
 
 
-@njit
+@kernel
 def _is_empty(a: int, b: int, c: int, n: int, d: F64, position: F64) -> bool:
     for i in range(n):
         if i != a and i != b and i != c:
@@ -387,3 +476,143 @@ def _is_empty(a: int, b: int, c: int, n: int, d: F64, position: F64) -> bool:
             if inside:
                 return False
     return True
+
+
+class Schedule(NamedTuple):
+    """When a waiting voxel is meshed; stamps count frames."""
+
+    wait: int  # frames a voxel collects evidence before its first patch
+    longest_wait: int  # frames after which it is decided whether waiting was worth it
+    growth: float  # evidence that has grown by this factor is worth a new patch
+    most: int  # voxels a frame
+
+
+@kernel
+def is_due(store: Store, v: int, stamp: int, schedule: Schedule) -> bool:
+    """Whether enough is new: a first patch after ``wait``, then new vertices or evidence grown ``growth`` fold."""
+    row = store.voxel[v]
+    if stamp - row[QUEUED] < schedule.wait and row[FRESH] < 64:
+        return False
+    if row[AT_MESH] == 0:
+        return row[PENDING] > 0
+    return row[FRESH] >= 4 or row[PENDING] >= schedule.growth * row[AT_MESH]
+
+
+@kernel
+def is_worth(store: Store, v: int) -> bool:
+    """Whether anything would visibly change: new vertices, or twice the evidence."""
+    row = store.voxel[v]
+    return row[FRESH] > 0 or row[PENDING] >= row[AT_MESH]
+
+
+@kernel
+def choose_batch(store: Store, stamp: int, schedule: Schedule, everything: bool, batch: I32) -> int:
+    """Take voxels that are due off the queue, oldest first, at most ``schedule.most``; returns how many.
+
+    Voxels not due go back; those that waited longest without being worth it leave the queue and keep their
+    pending counts.
+    """
+    n = 0
+    for _ in range(store.counter[QUEUE_LEN]):
+        if n == batch.shape[0]:
+            break
+        v = bs.dequeue(store)
+        row = store.voxel[v]
+        late = everything or stamp - row[QUEUED] >= schedule.longest_wait
+        if (late and is_worth(store, v)) or (not late and is_due(store, v, stamp, schedule)):
+            batch[n] = v
+            n += 1
+            row[QUEUED] = 0
+        elif late:
+            row[QUEUED] = 0
+        else:
+            since = row[QUEUED]
+            row[QUEUED] = 0
+            bs.enqueue(store, v, since)
+    return n
+
+
+@kernel
+def mesh_batch(
+    store: Store,
+    batch: I32,
+    stamp: int,
+    voxel_m: float,
+    plane_sigma_m: float,
+    min_distance: float,
+    rules: Rules,
+    w: Workspace,
+) -> int:
+    """Refresh the vertices of all voxels of the batch, then replace their patches; returns patches refused."""
+    cell_m = voxel_m / CELLS_PER_VOXEL
+    for v in batch:
+        row = store.voxel[v]
+        row[AT_MESH] += max(row[PENDING], 1)
+        row[PENDING] = 0
+        row[FRESH] = 0
+        refresh_voxel(store, v, cell_m, plane_sigma_m, min_distance, stamp, w.neighbour, w.grid, w.code, w.eigen)
+    refused = 0
+    for v in batch:
+        if not mesh_voxel(store, v, voxel_m, rules, w):
+            refused += 1
+        store.block[store.voxel[v, BLOCK], CHANGED] = stamp
+    return refused
+
+
+class Mesher:
+    """Keeps the patches of a ``VoxelMap`` up to date, a bounded number a frame."""
+
+    def __init__(self, config: MesherConfig, voxel_map: VoxelMap) -> None:
+        self._map = voxel_map
+        self._min_distance = config.min_distance * voxel_map.cell_m
+        cell = voxel_map.cell_m
+        self._rules = Rules(
+            short_edge_m=config.short_edge * cell,
+            long_edge_m=config.long_edge * cell,
+            well_seen=config.well_seen,
+            coplanar=config.coplanar,
+            agreement=config.agreement,
+            group_cosine=config.group_cosine,
+        )
+        self._schedule = Schedule(config.wait_frames, config.longest_wait_frames, config.growth, config.most_voxels)
+        self._workspace = workspace()
+        self._batch = np.empty(config.most_voxels, np.int32)
+        self.refused = 0
+
+    def update(self, active: I32, stamp: int) -> None:
+        """Mesh what is due after the voxels ``active`` received points in frame ``stamp``."""
+        enqueue_all(self._map.store, active, stamp)
+        self._mesh(choose_batch(self._map.store, stamp, self._schedule, False, self._batch), stamp)
+
+    def flush(self, stamp: int) -> None:
+        """Mesh everything that was postponed. Meshing can promote neighbours, hence until nothing is left."""
+        while True:
+            n = choose_batch(self._map.store, stamp, self._schedule, True, self._batch)
+            if n == 0:
+                return
+            self._mesh(n, stamp)
+
+    @property
+    def waiting(self) -> int:
+        """Voxels in the queue."""
+        return int(self._map.store.counter[QUEUE_LEN])
+
+    def _mesh(self, n: int, stamp: int) -> None:
+        self.refused += mesh_batch(
+            self._map.store,
+            self._batch[:n],
+            stamp,
+            self._map.config.voxel_m,
+            self._map.config.plane_sigma_m,
+            self._min_distance,
+            self._rules,
+            self._workspace,
+        )
+
+
+@kernel
+def enqueue_all(store: Store, voxels: I32, stamp: int) -> None:
+    """Let voxels wait for meshing when something about them is new."""
+    for v in voxels:
+        if store.voxel[v, PENDING] > 0 or store.voxel[v, FRESH] > 0:
+            bs.enqueue(store, v, stamp)

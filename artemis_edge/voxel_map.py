@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from artemis_edge import block_store as bs
-from artemis_edge._jit import njit
+from artemis_edge._jit import kernel
 from artemis_edge.block_store import (
     ALIVE,
     BLOCK,
@@ -20,20 +20,22 @@ from artemis_edge.block_store import (
     CONFIRMED,
     COUNT,
     EVIDENCE_ONLY,
+    FRESH,
     NORMAL,
     PENDING,
+    REFUSED_POINTS,
     POSITION,
     ROUGHNESS,
     SEEN,
-    SINCE,
     SQUARE,
     SUM,
     THROUGH,
     TOUCHED,
+    TOUCHED_BLOCKS,
     VIEW,
     Store,
 )
-from artemis_edge.cell_code import CODES, code_of, gather_cells
+from artemis_edge.cell_code import gather_cells
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.eigen3 import smallest_eigen3
 from artemis_edge.frames import F32, F64, I32, TrackedFrame
@@ -46,18 +48,24 @@ SATURATED_COUNT = 1000.0
 
 
 class VoxelMap:
-    """The paper's 3-D grid of voxels; see ``block_store`` for its memory.
+    """The paper's 3-D grid of voxels; see ``block_store`` for its memory, ``paging`` for what goes to disk.
 
     ``insert`` allocates a frame's points; ``store`` is read and written by the mesher.
     """
 
     def __init__(self, config: VoxelMapConfig, budget_bytes: float) -> None:
         self.config = config
+        self.cell_m = config.voxel_m / bs.CELLS_PER_VOXEL
+        self.block_m = config.voxel_m * bs.VOXELS_PER_BLOCK
         self.store = bs.allocate(budget_bytes)
         self._touched = np.empty(self.store.voxel.shape[0], np.int32)
 
-    def insert(self, frame: TrackedFrame) -> I32:
-        """Allocate the points of a frame; returns the slots of the voxels that received points."""
+    def insert(self, frame: TrackedFrame, stamp: int) -> I32:
+        """Allocate the points of a frame; returns the slots of the voxels that received points.
+
+        ``stamp`` counts frames from 1. ``touched_blocks`` tells the blocks afterwards.
+        """
+        self.store.counter[TOUCHED_BLOCKS] = 0
         n = 0
         for scan in frame.scans:
             n = insert_points(
@@ -65,18 +73,22 @@ class VoxelMap:
                 scan.points,
                 frame.T_world_lidar,
                 scan.origin,
-                self.config.voxel_m / bs.CELLS_PER_VOXEL,
+                self.cell_m,
                 self.config.min_range_m,
                 self.config.max_range_m,
                 self.config.noise_range_m,
-                frame.index + 1,
+                stamp,
                 self._touched,
                 n,
             )
         return self._touched[:n].copy()
 
+    def touched_blocks(self) -> I32:
+        """Slots of the blocks that received points in the last frame."""
+        return self.store.touched_block[: self.store.counter[TOUCHED_BLOCKS]]
 
-@njit
+
+@kernel
 def insert_points(
     store: Store,
     points: F32,
@@ -119,14 +131,16 @@ def insert_points(
                 touched[n] = v
                 n += 1
         if v < 0:
+            store.counter[REFUSED_POINTS] += 1
             continue
         c = ((cx & 3) << 4) | ((cy & 3) << 2) | (cz & 3)
         s = voxel_cell[v, c]
         if s < 0:
             s = bs.add_cell(store, v, c)
             if s < 0:
+                store.counter[REFUSED_POINTS] += 1
                 continue
-            voxel[v, PENDING] += 4
+            voxel[v, FRESH] += 1
         e = evidence[s]
         if e[COUNT] >= SATURATED_COUNT:
             continue
@@ -151,24 +165,28 @@ def insert_points(
     return n
 
 
-@njit
+@kernel
 def _voxel_at(store: Store, x: int, y: int, z: int, stamp: int) -> int:
     block = bs.find_or_add_block(store, x >> 3, y >> 3, z >> 3)
     if block < 0:
         return POOL_FULL
-    store.block[block, SEEN] = stamp
+    if store.block[block, SEEN] != stamp:
+        store.block[block, SEEN] = stamp
+        store.touched_block[store.counter[TOUCHED_BLOCKS]] = block
+        store.counter[TOUCHED_BLOCKS] += 1
     inner = bs.inner_index(x, y, z)
     v = store.block_voxel[block, inner]
     return v if v >= 0 else bs.add_voxel(store, block, inner, x, y, z)
 
 
-@njit
+@kernel
 def refresh_voxel(
     store: Store,
     v: int,
     cell_m: float,
     plane_sigma_m: float,
     min_distance: float,
+    stamp: int,
     neighbour: I32,
     grid: I32,
     code: I32,
@@ -191,12 +209,15 @@ def refresh_voxel(
             continue
         s = grid[code[i]]
         e = evidence[s]
+        if e[COUNT] == 0.0:  # carved away and not seen again
+            continue
+        if state[s] == CARVED and not is_seen_through(e):
+            state[s] = EVIDENCE_ONLY
         inverse = 1.0 / e[COUNT]
         mx, my, mz = e[SUM] * inverse, e[SUM + 1] * inverse, e[SUM + 2] * inverse
         N, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
         xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         vx, vy, vz = 0.0, 0.0, 0.0
-        near = False
         for dx in range(-1, 2):
             for dy in range(-1, 2):
                 for dz in range(-1, 2):
@@ -253,11 +274,36 @@ def refresh_voxel(
         p[ROUGHNESS] = math.sqrt(l0)
         if state[s] == EVIDENCE_ONLY and _is_apart(vertex, state, grid, code[i], s, min_distance):
             state[s] = ALIVE
+            _tell_neighbours(store, neighbour, X, Y, Z, stamp)
     for i in range(n):
         grid[code[i]] = -1
 
 
-@njit
+@kernel
+def _tell_neighbours(store: Store, neighbour: I32, X: int, Y: int, Z: int, stamp: int) -> None:
+    """A vertex began or ceased to live in cell X, Y, Z (0..3): voxels that have it in their margin must know."""
+    for k in range(27):
+        u = neighbour[k]
+        if k == 13 or u < 0:
+            continue
+        dx, dy, dz = k // 9 - 1, (k // 3) % 3 - 1, k % 3 - 1
+        near = (
+            (dx == 0 or (dx < 0 and X == 0) or (dx > 0 and X == 3))
+            and (dy == 0 or (dy < 0 and Y == 0) or (dy > 0 and Y == 3))
+            and (dz == 0 or (dz < 0 and Z == 0) or (dz > 0 and Z == 3))
+        )
+        if near and store.voxel[u, bs.AT_MESH] > 0:
+            store.voxel[u, FRESH] += 1
+            bs.enqueue(store, u, stamp)
+
+
+@kernel
+def is_seen_through(e: F32) -> bool:
+    """Whether the looks through a cell outweigh those that ended in it (visibility.py)."""
+    return e[THROUGH] >= 2.0 and e[THROUGH] >= 0.3 * (e[THROUGH] + e[CONFIRMED] + 1.0)
+
+
+@kernel
 def _is_apart(vertex: F32, state: np.ndarray, grid: I32, at: int, s: int, min_distance: float) -> bool:
     p = vertex[s]
     for dx in range(-1, 2):

@@ -1,0 +1,449 @@
+"""Pages: a block of the map as plain arrays, to be drawn, written, sent to disk and brought back.
+
+A page names cells by their place in the block, so it means the same wherever the block's slots were.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from artemis_edge import block_store as bs
+from artemis_edge._jit import kernel
+from artemis_edge.block_store import (
+    ALIVE,
+    AT_MESH,
+    BX,
+    CHANGED,
+    FRESH,
+    PATCH_AT,
+    PATCH_LEN,
+    PENDING,
+    QUEUED,
+    SEEN,
+    Store,
+)
+from artemis_edge.frames import F32, I32, I64, U8, Bool
+
+_HEADER = struct.Struct("<4sIiiiIII")
+_MAGIC = b"AEP1"
+_META = (PENDING, FRESH, AT_MESH)
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """One block or several: rows of ``block`` (b, 3) own ``n_voxels`` voxels each, those own cells and triangles.
+
+    ``inner`` int16 (v,) place of a voxel in its block, ``meta`` int32 (v, 3), ``n_cells`` and ``n_triangles``
+    int16 (v,); ``cell`` uint8 (c,), ``evidence`` float32 (c, 16), ``vertex`` float32 (c, 8), ``state`` uint8 (c,);
+    ``triangle`` uint16 (t, 3) codes.
+    """
+
+    block: I32
+    n_voxels: I32
+    inner: np.ndarray
+    meta: I32
+    n_cells: np.ndarray
+    n_triangles: np.ndarray
+    cell: U8
+    evidence: F32
+    vertex: F32
+    state: U8
+    triangle: np.ndarray
+
+    def voxel_index(self) -> I64:
+        """Voxel coordinates int64 (v, 3)."""
+        base = np.repeat(self.block.astype(np.int64) * 8, self.n_voxels, axis=0)
+        inner = self.inner.astype(np.int64)
+        return base + np.stack((inner >> 6, (inner >> 3) & 7, inner & 7), axis=1)
+
+    def vertex_ids(self) -> I64:
+        """Name of every cell's vertex, int64 (c,): its cell coordinates, 21 bits each."""
+        voxel = np.repeat(self.voxel_index(), self.n_cells, axis=0)
+        cell = self.cell.astype(np.int64)
+        return _pack_ids(voxel[:, 0] * 4 + (cell >> 4), voxel[:, 1] * 4 + ((cell >> 2) & 3), voxel[:, 2] * 4 + (cell & 3))
+
+    def triangle_ids(self) -> I64:
+        """Vertex names of every triangle, int64 (t, 3)."""
+        voxel = np.repeat(self.voxel_index(), self.n_triangles, axis=0) * 4 - 12
+        code = self.triangle.astype(np.int64) & (EAR_MASK)
+        x, y, z = code >> 10, (code >> 5) & 31, code & 31
+        return _pack_ids(x + voxel[:, 0:1], y + voxel[:, 1:2], z + voxel[:, 2:3])
+
+    def alive(self) -> Bool:
+        """Which cells hold a living vertex, bool (c,)."""
+        return self.state == ALIVE
+
+
+EAR_MASK = 0x7FFF  # the 16th bit of a code is the mesher's
+
+
+def _pack_ids(x: I64, y: I64, z: I64) -> I64:
+    bias = 1 << 20
+    return ((x + bias) << 42) | ((y + bias) << 21) | (z + bias)
+
+
+@kernel
+def count_blocks(store: Store, slots: I32, n_voxels: I32) -> tuple[int, int, int]:
+    """Voxels, cells and triangles of blocks; ``n_voxels`` (b,) is filled."""
+    voxels = cells = triangles = 0
+    for i in range(slots.shape[0]):
+        n_voxels[i] = 0
+        for inner in range(512):
+            v = store.block_voxel[slots[i], inner]
+            if v < 0:
+                continue
+            n_voxels[i] += 1
+            triangles += store.voxel[v, PATCH_LEN]
+            for c in range(64):
+                cells += store.voxel_cell[v, c] >= 0
+        voxels += n_voxels[i]
+    return voxels, cells, triangles
+
+
+@kernel
+def fill_page(
+    store: Store,
+    slots: I32,
+    inner: np.ndarray,
+    meta: I32,
+    n_cells: np.ndarray,
+    n_triangles: np.ndarray,
+    cell: U8,
+    evidence: F32,
+    vertex: F32,
+    state: U8,
+    triangle: np.ndarray,
+) -> None:
+    """Copy blocks into the arrays of a page."""
+    i = j = k = 0
+    for slot in slots:
+        for place in range(512):
+            v = store.block_voxel[slot, place]
+            if v < 0:
+                continue
+            inner[i] = place
+            meta[i, 0], meta[i, 1], meta[i, 2] = store.voxel[v, PENDING], store.voxel[v, FRESH], store.voxel[v, AT_MESH]
+            n_triangles[i] = store.voxel[v, PATCH_LEN]
+            for t in range(store.voxel[v, PATCH_LEN]):
+                for q in range(3):
+                    triangle[k, q] = store.triangle[store.voxel[v, PATCH_AT] + t, q]
+                k += 1
+            first = j
+            for c in range(64):
+                s = store.voxel_cell[v, c]
+                if s < 0:
+                    continue
+                cell[j] = c
+                state[j] = store.state[s]
+                for q in range(16):
+                    evidence[j, q] = store.evidence[s, q]
+                for q in range(8):
+                    vertex[j, q] = store.vertex[s, q]
+                j += 1
+            n_cells[i] = j - first
+            i += 1
+
+
+def pack(store: Store, slots: I32) -> Page:
+    """Page of resident blocks, in the order of ``slots``."""
+    n_voxels = np.empty(len(slots), np.int32)
+    v, c, t = count_blocks(store, slots, n_voxels)
+    page = Page(
+        block=store.block[slots, BX : BX + 3].copy(),
+        n_voxels=n_voxels,
+        inner=np.empty(v, np.int16),
+        meta=np.empty((v, 3), np.int32),
+        n_cells=np.empty(v, np.int16),
+        n_triangles=np.empty(v, np.int16),
+        cell=np.empty(c, np.uint8),
+        evidence=np.empty((c, 16), np.float32),
+        vertex=np.empty((c, 8), np.float32),
+        state=np.empty(c, np.uint8),
+        triangle=np.empty((t, 3), np.uint16),
+    )
+    fill_page(
+        store,
+        slots,
+        page.inner,
+        page.meta,
+        page.n_cells,
+        page.n_triangles,
+        page.cell,
+        page.evidence,
+        page.vertex,
+        page.state,
+        page.triangle,
+    )
+    return page
+
+
+@kernel
+def restore_block(
+    store: Store,
+    block: int,
+    stamp: int,
+    inner: np.ndarray,
+    meta: I32,
+    n_cells: np.ndarray,
+    n_triangles: np.ndarray,
+    cell: U8,
+    evidence: F32,
+    vertex: F32,
+    state: U8,
+    triangle: np.ndarray,
+) -> bool:
+    """Bring one block's page back into slot ``block``, which may have received points since; False: no room.
+
+    Evidence adds up. A patch made since then is kept, else the page's comes back.
+    """
+    j = k = 0
+    x0, y0, z0 = store.block[block, 0] * 8, store.block[block, 1] * 8, store.block[block, 2] * 8
+    for i in range(inner.shape[0]):
+        place = np.int64(inner[i])
+        v = store.block_voxel[block, place]
+        if v < 0:
+            v = bs.add_voxel(store, block, place, x0 + (place >> 6), y0 + ((place >> 3) & 7), z0 + (place & 7))
+            if v < 0:
+                return False
+        store.voxel[v, PENDING] += meta[i, 0]
+        store.voxel[v, FRESH] += meta[i, 1]
+        store.voxel[v, AT_MESH] += meta[i, 2]
+        for _ in range(n_cells[i]):
+            s = store.voxel_cell[v, cell[j]]
+            if s < 0:
+                s = bs.add_cell(store, v, cell[j])
+                if s < 0:
+                    return False
+            for q in range(16):
+                store.evidence[s, q] += evidence[j, q]
+            if store.state[s] == 0:
+                store.state[s] = state[j]
+                for q in range(8):
+                    store.vertex[s, q] = vertex[j, q]
+            j += 1
+        if store.voxel[v, PATCH_LEN] == 0:
+            bs.set_patch(store, v, triangle[k : k + n_triangles[i]], n_triangles[i])
+        k += n_triangles[i]
+    store.block[block, SEEN] = stamp
+    return True
+
+
+@kernel
+def has_waiting(store: Store, block: int) -> bool:
+    """Whether a voxel of the block waits for meshing."""
+    for inner in range(512):
+        v = store.block_voxel[block, inner]
+        if v >= 0 and store.voxel[v, QUEUED] != 0:
+            return True
+    return False
+
+
+@kernel
+def resident_blocks(store: Store, out: I32) -> int:
+    """Slots of all resident blocks."""
+    n = 0
+    for at in range(store.hash_key.shape[0]):
+        if store.hash_key[at] != bs.EMPTY_KEY:
+            out[n] = store.hash_slot[at]
+            n += 1
+    return n
+
+
+def page_bytes(page: Page) -> bytes:
+    """A page of one block as bytes."""
+    head = _HEADER.pack(_MAGIC, len(page.inner), *page.block[0].tolist(), len(page.cell), len(page.triangle), 0)
+    parts = (
+        page.inner,
+        page.meta,
+        page.n_cells,
+        page.n_triangles,
+        page.cell,
+        page.evidence,
+        page.vertex,
+        page.state,
+        page.triangle,
+    )
+    return head + b"".join(np.ascontiguousarray(p).tobytes() for p in parts)
+
+
+def page_from_bytes(data: bytes) -> Page:
+    """Inverse of ``page_bytes``; ValueError when the bytes are not a whole page."""
+    if len(data) < _HEADER.size:
+        raise ValueError("page too short")
+    magic, v, bx, by, bz, c, t, _ = _HEADER.unpack_from(data)
+    if magic != _MAGIC:
+        raise ValueError("not a page")
+    shapes: list[tuple[str, tuple[int, ...]]] = [
+        ("<i2", (v,)),
+        ("<i4", (v, 3)),
+        ("<i2", (v,)),
+        ("<i2", (v,)),
+        ("<u1", (c,)),
+        ("<f4", (c, 16)),
+        ("<f4", (c, 8)),
+        ("<u1", (c,)),
+        ("<u2", (t, 3)),
+    ]
+    at, arrays = _HEADER.size, []
+    for kind, shape in shapes:
+        count = int(np.prod(shape))
+        if at + count * np.dtype(kind).itemsize > len(data):
+            raise ValueError("page cut off")
+        arrays.append(np.frombuffer(data, kind, count, at).reshape(shape))
+        at += count * np.dtype(kind).itemsize
+    return Page(np.array([[bx, by, bz]], np.int32), np.array([v], np.int32), *arrays)
+
+
+class PageFile:
+    """Blocks on disk: an append-only file and the place of each block's newest page in it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "pages.bin"
+        self._file: BinaryIO | None = None
+        self._place: dict[int, tuple[int, int]] = {}
+        self._end = 0
+
+    def __len__(self) -> int:
+        return len(self._place)
+
+    def __contains__(self, key: int) -> bool:
+        return key in self._place
+
+    def keys(self) -> I64:
+        """Sorted keys of the blocks on disk."""
+        return np.array(sorted(self._place), np.int64)
+
+    def put(self, key: int, page: Page) -> None:
+        """Append a page; the file is made when first needed."""
+        if self._file is None:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self._path.open("w+b")
+        data = page_bytes(page)
+        self._file.seek(self._end)
+        self._file.write(data)
+        self._place[key] = (self._end, len(data))
+        self._end += len(data)
+
+    def get(self, key: int) -> Page:
+        """The newest page of a block."""
+        assert self._file is not None
+        at, size = self._place[key]
+        self._file.seek(at)
+        return page_from_bytes(self._file.read(size))
+
+    def take(self, key: int) -> Page:
+        """The page of a block that becomes resident again."""
+        page = self.get(key)
+        del self._place[key]
+        return page
+
+    def close(self) -> None:
+        """Close and remove the file: the map is saved elsewhere."""
+        if self._file is not None:
+            self._file.close()
+            self._path.unlink(missing_ok=True)
+            self._file = None
+
+
+def slot_keys(store: Store, slots: I32) -> I64:
+    """Keys of resident blocks, int64 (b,)."""
+    return block_keys(store.block[slots, BX : BX + 3])
+
+
+def block_keys(block: I32) -> I64:
+    """Keys of block indices (b, 3), as ``block_store.block_key``."""
+    b = block.astype(np.int64)
+    return _pack_ids(b[:, 0], b[:, 1], b[:, 2])
+
+
+class Pager:
+    """Keeps a store within its pools: the least recently seen blocks go to disk and come back when touched."""
+
+    def __init__(self, store: Store, folder: Path) -> None:
+        self._store = store
+        self.file = PageFile(folder)
+        self._slots = np.empty(store.block.shape[0], np.int32)
+        self.paged_out = 0
+        self.paged_in = 0
+
+    def resident(self) -> I32:
+        """Slots of resident blocks, sorted by key."""
+        slots = self._slots[: resident_blocks(self._store, self._slots)].copy()
+        return slots[np.argsort(slot_keys(self._store, slots), kind="stable")]
+
+    def bring_back(self, touched: I32, stamp: int) -> None:
+        """Load the pages of touched blocks and of their neighbours, whose patches must meet."""
+        if len(self.file) == 0 or len(touched) == 0:
+            return
+        block = self._store.block[touched, BX : BX + 3]
+        around = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        keys = np.unique(block_keys((block[:, None] + around[None]).reshape(-1, 3).astype(np.int32)))
+        for key in np.intersect1d(keys, self.file.keys(), assume_unique=True).tolist():
+            self._restore(key, stamp)
+
+    def make_room(self, stamp: int, busy_frames: int = 50) -> None:
+        """Send blocks to disk when a pool is 85 % full, until it is 70 % full; never one seen lately."""
+        if self.fill() < 0.85:
+            return
+        slots = self.resident()
+        seen = self._store.block[slots, SEEN]
+        for slot in slots[np.argsort(seen, kind="stable")]:
+            if self._store.block[slot, SEEN] > stamp - busy_frames or self.fill() < 0.70:
+                return
+            if not has_waiting(self._store, slot):
+                one = np.array([slot], np.int32)
+                self.file.put(int(slot_keys(self._store, one)[0]), pack(self._store, one))
+                bs.remove_block(self._store, slot)
+                self.paged_out += 1
+
+    def fill(self) -> float:
+        """Share of the fullest pool that is in use."""
+        c, s = self._store.counter, self._store
+        free = (s.free_patches * (bs.SMALLEST_ROOM << np.arange(bs.PATCH_CLASSES))).sum()
+        return float(
+            max(
+                (c[bs.N_BLOCKS] - c[bs.FREE_BLOCKS]) / len(s.block),
+                (c[bs.N_VOXELS] - c[bs.FREE_VOXELS]) / len(s.voxel),
+                (c[bs.N_CELLS] - c[bs.FREE_CELLS]) / len(s.evidence),
+                (c[bs.N_TRIANGLES] - free) / len(s.triangle),
+            )
+        )
+
+    def pages(self) -> Iterator[Page]:
+        """Every block of the map, resident or not, in order of keys; a page a block."""
+        resident = self.resident()
+        place = dict(zip(slot_keys(self._store, resident).tolist(), resident.tolist(), strict=True))
+        for key in sorted([*place, *self.file.keys().tolist()]):
+            if key in place:
+                yield pack(self._store, np.array([place[key]], np.int32))
+            else:
+                yield self.file.get(key)
+
+    def _restore(self, key: int, stamp: int) -> None:
+        page = self.file.take(key)
+        bx, by, bz = page.block[0].tolist()
+        slot = bs.find_or_add_block(self._store, bx, by, bz)
+        fits = slot >= 0 and restore_block(
+            self._store,
+            slot,
+            stamp,
+            page.inner,
+            page.meta,
+            page.n_cells,
+            page.n_triangles,
+            page.cell,
+            page.evidence,
+            page.vertex,
+            page.state,
+            page.triangle,
+        )
+        if not fits:
+            raise MemoryError("the memory budget is too small for what is in view; raise voxel_map.memory_budget_mb")
+        self._store.block[slot, CHANGED] = stamp
+        self.paged_in += 1

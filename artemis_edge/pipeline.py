@@ -1,0 +1,93 @@
+"""The paper's Fig. 2: one call a stage, in order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+from artemis_edge.block_store import REFUSED_POINTS
+from artemis_edge.config import Config
+from artemis_edge.delta import MeshDelta, Outbox
+from artemis_edge.export.mesh import Mesh
+from artemis_edge.frames import F64, Odometry, SyncedFrame
+from artemis_edge.map_writer import save_map, write_mesh
+from artemis_edge.mesher import Mesher
+from artemis_edge.paging import Pager
+from artemis_edge.visibility import FreeSpace
+from artemis_edge.voxel_map import VoxelMap
+
+# Python, numba and the libraries before the first frame, and what writing the results takes (docs/tuning.md) [MB]
+BASE_MB = 450
+
+
+class Pipeline:
+    """Frames in, mesh deltas out. Knows nothing of files it was fed from, terminals or sockets."""
+
+    def __init__(self, config: Config, odometry: Odometry, page_folder: Path) -> None:
+        self.config = config
+        self.odometry = odometry
+        self.voxel_map = VoxelMap(config.voxel_map, (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6)
+        self.mesher = Mesher(config.mesher, self.voxel_map)
+        self.free_space = FreeSpace(config.voxel_map, self.voxel_map)
+        self.pager = Pager(self.voxel_map.store, page_folder)
+        self.outbox = Outbox(self.voxel_map.store)
+        self.trajectory: list[tuple[int, F64]] = []
+        self.stage_ms: dict[str, float] = {}
+        self._stamp = 0
+
+    def process(self, frame: SyncedFrame) -> MeshDelta:
+        """All stages for one frame."""
+        self._stamp += 1
+        self.stage_ms = {}
+        with self._stage("odometry"):
+            tracked = self.odometry.track(frame)
+        with self._stage("voxel_map"):
+            active = self.voxel_map.insert(tracked, self._stamp)
+            self.pager.bring_back(self.voxel_map.touched_blocks(), self._stamp)
+        with self._stage("free_space"):
+            self.free_space.carve(tracked, self._stamp)
+        with self._stage("mesher"):
+            self.mesher.update(active, self._stamp)
+        with self._stage("delta"):
+            delta = self.outbox.changed(frame.index)
+            self.pager.make_room(self._stamp)
+        self.trajectory.append((tracked.stamp_ns, tracked.T_world_lidar))
+        return delta
+
+    def finish(self) -> MeshDelta:
+        """Everything postponed; the delta holds all that was not told yet."""
+        self.stage_ms = {}
+        with self._stage("mesher"):
+            self.mesher.flush(self._stamp)
+        with self._stage("delta"):
+            return self.outbox.everything(self._stamp)
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """What the stages could not take, by reason; empty when nothing was lost."""
+        counts = {
+            "points_without_memory": int(self.voxel_map.store.counter[REFUSED_POINTS]),
+            "patches_without_memory": self.mesher.refused,
+        }
+        return {reason: n for reason, n in counts.items() if n}
+
+    def write_mesh(self, path: Path) -> Mesh:
+        """Write ``mesh.ply`` and return the mesh."""
+        return write_mesh(path, self.pager, self.config.mesher.smallest_island)
+
+    def save(self, folder: Path) -> int:
+        """Write what reopens the map; returns its size in bytes."""
+        size = save_map(folder, self.pager, self.config)
+        self.pager.file.close()
+        return size
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stage_ms[name] = self.stage_ms.get(name, 0.0) + (time.perf_counter() - start) * 1e3
