@@ -8,8 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from artemis_edge.frames import F64, ImuSamples
+from artemis_edge.odometry import se3
 
 _GRAVITY = 9.81
+_HALF_SCAN_NS = 50_000_000  # a frame is a window of 100 ms
 _STEADY = 0.3  # accepted deviation of the mean specific force from gravity, as a share of it
 
 
@@ -35,7 +37,7 @@ def shortest_rotation(a: F64, b: F64) -> F64:
         normal = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
         normal /= np.linalg.norm(normal)
         return 2.0 * np.outer(normal, normal) - np.eye(3)
-    W = np.cross(np.eye(3), -axis)
+    W: F64 = se3.skew(axis)
     return np.eye(3) + W + W @ W / (1.0 + cosine)
 
 
@@ -54,6 +56,11 @@ def mean_rate(imu: ImuSamples, start_ns: int, stop_ns: int) -> F64 | None:
     """Mean angular velocity (3,) of the samples within a time, rad/s in their axes; None without any."""
     inside = (imu.stamp_ns > start_ns) & (imu.stamp_ns <= stop_ns)
     return imu.gyro[inside].mean(axis=0) if inside.any() else None
+
+
+def rate_during(imu: ImuSamples, middle_ns: int) -> F64 | None:
+    """Mean angular velocity (3,) during the scan with this middle, rad/s; None without samples."""
+    return mean_rate(imu, middle_ns - _HALF_SCAN_NS, middle_ns + _HALF_SCAN_NS)
 
 
 def since(imu: ImuSamples, stamp_ns: int) -> ImuSamples:

@@ -5,6 +5,7 @@ The filter (IMU, images) of a later version takes this place and keeps ``Odometr
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,11 @@ class _First(NamedTuple):
     T_world_lidar: F64
     lead_s: float
     dense: TimedPoints
+
+    def at_middle(self, twist: F64) -> F64:
+        """T_world_lidar (4, 4) at the middle of the scan if this was the body twist (6,)."""
+        pose: F64 = self.T_world_lidar @ se3.exp(self.lead_s * twist)
+        return pose
 
 
 class LidarOdometry:
@@ -87,10 +93,12 @@ class LidarOdometry:
 
     def _seed(self, T_world_lidar: F64, stamp_ns: int, scan: ThinScan) -> None:
         """Begin the map with a scan, at a pose that holds at the frame's stamp."""
-        self._motion = Motion(T_world_lidar, scan.stamp_ns, np.zeros(6))
+        rate = inertial.rate_during(self._imu, scan.stamp_ns)
+        twist = np.concatenate([np.zeros(3), np.zeros(3) if rate is None else rate])
         self._first = _First(T_world_lidar, (scan.stamp_ns - stamp_ns) * 1e-9, scan.dense)
+        self._motion = Motion(self._first.at_middle(twist), scan.stamp_ns, twist)
         self._map.clear()
-        self._map.insert(scan.dense.points, T_world_lidar)
+        self._map.insert(scan.dense.at_one_time(twist), self._motion.T_world_lidar)
         self._evicted_at = T_world_lidar[:3, 3]
 
     def _correct_first(
@@ -98,12 +106,13 @@ class LidarOdometry:
     ) -> tuple[Prediction, Registration | None]:
         """Make the map anew from the first scan with the motion now known, and register the second again."""
         refined: Registration | None = found
+        prediction = replace(prediction, assumed=None)
         for _ in range(_START_ROUNDS):
             if refined is None:
                 break
             twist = prediction.twist(refined.T_world_lidar)
             T_old_new = se3.inverse(prediction.T_world_start) @ refined.T_world_lidar
-            prediction = prediction.rebased(first.T_world_lidar @ se3.exp(first.lead_s * twist))
+            prediction = prediction.rebased(first.at_middle(twist))
             self._map.clear()
             self._map.insert(first.dense.at_one_time(twist), prediction.T_world_start)
             refined = self._aligner.refine(scan.sparse, prediction, prediction.T_world_start @ T_old_new)

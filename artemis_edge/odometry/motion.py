@@ -9,17 +9,17 @@ import numpy as np
 from artemis_edge.config import OdometryConfig
 from artemis_edge.frames import F64, ImuSamples
 from artemis_edge.odometry import se3
-from artemis_edge.odometry.imu import mean_rate
+from artemis_edge.odometry.imu import mean_rate, rate_during
 
 _SAME_TIME_S = 1e-3  # frames that share a stamp are taken to be a millisecond apart
-_HALF_SCAN_NS = 50_000_000  # a frame is a window of 100 ms
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
     """Guess of a scan's pose, one deviation of its place (m) and attitude (rad), and where it came from.
 
-    ``turn_rate`` (3,) rad/s is what a gyroscope measured during the scan, or None.
+    ``turn_rate`` (3,) rad/s is what a gyroscope measured during the scan, or None. ``assumed`` (6,) is a
+    twist during the scan that is taken whatever the pose, or None.
     """
 
     T_world_start: F64
@@ -28,9 +28,12 @@ class Prediction:
     sigma_m: float
     sigma_rad: float
     turn_rate: F64 | None = None
+    assumed: F64 | None = None
 
     def twist(self, T_world_lidar: F64) -> F64:
         """Body twist (6,) during the scan if this is its pose: the mean on the way, its turn as measured."""
+        if self.assumed is not None:
+            return self.assumed
         twist: F64 = se3.log(se3.inverse(self.T_world_start) @ T_world_lidar) / self.elapsed_s
         if self.turn_rate is not None:
             twist[3:] = self.turn_rate
@@ -38,8 +41,8 @@ class Prediction:
 
     def rebased(self, T_world_start: F64) -> Prediction:
         """The same motion from another start."""
-        T_new_old = T_world_start @ se3.inverse(self.T_world_start)
-        return replace(self, T_world_start=T_world_start, T_world_lidar=T_new_old @ self.T_world_lidar)
+        T = T_world_start @ se3.inverse(self.T_world_start) @ self.T_world_lidar
+        return replace(self, T_world_start=T_world_start, T_world_lidar=T)
 
     def information(self) -> F64:
         """Inverse covariance (6, 6) of a right perturbation of the pose."""
@@ -73,7 +76,8 @@ class Motion:
         """Constant velocity to a later scan; the turn as ``imu`` measured it, where it has samples.
 
         The deviation is what the stated accelerations can do in the time; while the velocity is not known
-        (the second frame), what the stated starting speeds can do.
+        (the second frame), what the stated starting speeds can do, and the scan is left as the first one was:
+        two scans that are distorted alike tell the motion between them well.
         """
         elapsed = max((stamp_ns - self.stamp_ns) * 1e-9, _SAME_TIME_S)
         twist = self.twist.copy()
@@ -87,5 +91,6 @@ class Motion:
             twist[3:] = rate
             sigma_rad = config.gyro_sigma * elapsed
         T = self.T_world_lidar @ se3.exp(elapsed * twist)
-        during = mean_rate(imu, stamp_ns - _HALF_SCAN_NS, stamp_ns + _HALF_SCAN_NS)
-        return Prediction(self.T_world_lidar, T, elapsed, sigma_m, sigma_rad, during)
+        assumed = None if self.known else self.twist
+        during = rate_during(imu, stamp_ns)
+        return Prediction(self.T_world_lidar, T, elapsed, sigma_m, sigma_rad, during, assumed)

@@ -25,7 +25,8 @@ _MIX = 0x9E3779B97F4A7C15 - (1 << 64)  # 2^64 / golden ratio spreads neighbourin
 MIN_POINTS = 6  # three define a plane, three more say how well
 _MAX_POINTS = 400.0  # then the moments are halved: the map follows a scene that changes
 _REFIT_GROWTH = 1.2  # a plane is fitted anew when its voxel has 20 % more points
-_MAX_THICKNESS = 0.1  # smallest / middle eigenvalue: a plane is at least three times as wide as thick
+_MAX_THICKNESS = 0.05  # smallest / middle eigenvalue: where a scan line turns a corner it is larger
+_MIN_WIDTH = 0.02  # deviation across, as a share of the voxel: what is narrower is a line, of any normal
 _SHRINK = 0.8  # radius kept when the map is full is shortened by this until half the slots are free
 
 
@@ -125,9 +126,15 @@ def voxel_key(level: int, x: int, y: int, z: int) -> int:
 
 
 @njit
+def _size(key: int, voxel_m: float) -> float:
+    """Edge of a voxel, m."""
+    return voxel_m * (1 << (key >> (3 * _AXIS_BITS)))
+
+
+@njit
 def _corner(key: int, voxel_m: float) -> tuple[float, float, float]:
     """Lower corner of a voxel in world, m."""
-    size = voxel_m * (1 << (key >> (3 * _AXIS_BITS)))
+    size = _size(key, voxel_m)
     x = ((key >> (2 * _AXIS_BITS)) & _AXIS_MASK) - _HALF
     y = ((key >> _AXIS_BITS) & _AXIS_MASK) - _HALF
     z = (key & _AXIS_MASK) - _HALF
@@ -267,7 +274,7 @@ def _fit(row: F64, key: int, voxel_m: float) -> None:
     smallest_eigen3(xx, xy, xz, yy, yz, zz, e)
     a, b, c, thin, middle, wide = e
     row[FITTED], row[THICKNESS] = n, -1.0
-    if not (thin <= _MAX_THICKNESS * middle and middle > 0.0):
+    if not (thin <= _MAX_THICKNESS * middle and middle >= (_MIN_WIDTH * _size(key, voxel_m)) ** 2):
         return
     row[THICKNESS] = max(thin, 0.0) * n / (n - 3.0)  # a plane leaves n - 3 degrees of freedom
     row[NORMAL], row[NORMAL + 1], row[NORMAL + 2] = a, b, c

@@ -34,18 +34,22 @@ from artemis_edge.odometry.plane_map import (
 )
 from artemis_edge.odometry.thin import TimedPoints
 
-DEGENERATE = 0.01  # smallest eigenvalue of the mean of n n' below which a direction counts as not observed
+DEGENERATE = 0.01  # smallest eigenvalue of the weighted mean of n n' for which a direction is observed
 _PASSES = 2  # the motion within the scan is corrected anew after the first
 _ITERATIONS = 12
 _CONVERGED_M = 1e-3  # mean displacement of the points by a step; a thirtieth of their noise
 _REMATCH = 0.05  # displacement, as a share of the voxel in use, after which planes are looked up again
 _GATE2 = 9.0  # three deviations
+_GRAZING2 = 0.05**2  # squared sine of incidence; a sheet seen edge-on is one laser line and its noise
 _KERNEL2 = 4.0  # Geman-McClure: a residual of two deviations has a quarter of the weight
 _MATCH_COLUMNS = 8  # point in the lidar frame (3), normal (3), n . c (1), variance of the plane there (1)
 
 
 class Registration(NamedTuple):
-    """Pose, mean of n n' over the matches (lidar frame), their number, share of the scan explained."""
+    """Pose, how well each direction is observed, number of matches, share of the scan explained.
+
+    ``N`` (3, 3) is the mean of n n' over the matches in the lidar frame, weighted by their certainty.
+    """
 
     T_world_lidar: F64
     N: F64
@@ -56,15 +60,19 @@ class Registration(NamedTuple):
 class Linearised(NamedTuple):
     """Normal equations of a right perturbation T exp(x): ``H`` (6, 6) x = -``g`` (6,).
 
-    ``N`` (3, 3) is the mean of n n' over the ``matches`` inliers in the lidar frame, ``weight`` the sum of
-    their robust weights 0..1.
+    ``matches`` is the number of inliers, ``weight`` the sum of their weights (1/m2), ``score`` the sum of the
+    robust part of them, 0..1 each.
     """
 
     H: F64
     g: F64
-    N: F64
     matches: int
     weight: float
+    score: float
+
+    def observed(self) -> F64:
+        """Weighted mean of n n' (3, 3); zero without matches."""
+        return self.H[:3, :3] / self.weight if self.weight > 0.0 else np.zeros((3, 3))
 
 
 def register(
@@ -89,7 +97,7 @@ def register(
             if stale or finest != level or moved > _REMATCH * plane_map.voxel_m * 2**finest:
                 level, moved, stale = finest, 0.0, False
                 matched = match(plane_map, points, T, finest, sigma_m**2 + tau_m**2)
-            x = _step(linearise(matched, T, sigma_m**2 + tau_m**2), T, prediction, sigma_m)
+            x = _step(linearise(matched, T, sigma_m**2 + tau_m**2), T, prediction)
             T = T @ se3.exp(x)
             step = float(np.linalg.norm(x[:3]) + arm * np.linalg.norm(x[3:]))
             moved, tau_m = moved + step, min(0.5 * tau_m, step)
@@ -103,7 +111,7 @@ def judge(
 ) -> Registration:
     """How well points float32 (n, 3) of one time fit the map at a pose."""
     lin = linearise(match(plane_map, points, T_world_lidar, finest, sigma_m**2), T_world_lidar, sigma_m**2)
-    return Registration(T_world_lidar, lin.N, lin.matches, lin.weight / max(len(points), 1))
+    return Registration(T_world_lidar, lin.observed(), lin.matches, lin.score / max(len(points), 1))
 
 
 def match(plane_map: PlaneMap, points: F32, T_world_lidar: F64, finest: int, noise2: float) -> F64:
@@ -119,15 +127,15 @@ def arm_m(points: F32) -> float:
     return float(np.sqrt(3.0 * np.mean(np.square(points, dtype=np.float64)))) if len(points) else 0.0
 
 
-def _step(lin: Linearised, T_world_lidar: F64, prediction: Prediction, sigma_m: float) -> F64:
+def _step(lin: Linearised, T_world_lidar: F64, prediction: Prediction) -> F64:
     """Perturbation (6,) that solves the normal equations and the prior.
 
     A direction that the planes hardly observe borrows from the prediction what it lacks to the threshold:
     otherwise the noise of the normals would hold the sensor still along a corridor.
     """
     P = prediction.information()
-    values, vectors = np.linalg.eigh(lin.N)
-    lent = np.maximum(DEGENERATE - values, 0.0) * lin.matches / sigma_m**2
+    values, vectors = np.linalg.eigh(lin.observed())
+    lent = np.maximum(DEGENERATE - values, 0.0) * lin.weight
     P[:3, :3] += (vectors * lent) @ vectors.T
     off = se3.log(se3.inverse(prediction.T_world_lidar) @ T_world_lidar)
     x: F64 = -np.linalg.solve(lin.H + P, lin.g + P @ off)
@@ -152,6 +160,8 @@ def match_planes(
             if slot < 0 or not refresh(table, slot, voxel_m):
                 continue
             w = table.rows[slot]
+            if _grazing(w, x - T[0, 3], y - T[1, 3], z - T[2, 3]):
+                continue
             dx, dy, dz = x - w[CENTRE], y - w[CENTRE + 1], z - w[CENTRE + 2]
             r = w[NORMAL] * dx + w[NORMAL + 1] * dy + w[NORMAL + 2] * dz
             variance = w[THICKNESS] * (1.0 + (1.0 + _spread(w, dx, dy, dz)) / w[COUNT])
@@ -167,6 +177,13 @@ def match_planes(
 
 
 @njit
+def _grazing(row: F64, vx: float, vy: float, vz: float) -> bool:
+    """Does the line of sight (world, m) lie in the plane?"""
+    across = row[NORMAL] * vx + row[NORMAL + 1] * vy + row[NORMAL + 2] * vz
+    return bool(across * across < _GRAZING2 * (vx * vx + vy * vy + vz * vz))
+
+
+@njit
 def _spread(row: F64, dx: float, dy: float, dz: float) -> float:
     """d' M d of the module's formula."""
     m = row[SPREAD:]
@@ -179,7 +196,7 @@ def _spread(row: F64, dx: float, dy: float, dz: float) -> float:
 def linearise(matched: F64, T_world_lidar: F64, noise2: float) -> Linearised:
     """Robust normal equations of matched planes (m, 8); matches beyond three deviations have no weight."""
     T = T_world_lidar
-    H, g, N, matches, total = np.zeros((6, 6)), np.zeros(6), np.zeros((3, 3)), 0, 0.0
+    H, g, matches, total, score = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
     J = np.empty(6)
     for i in range(len(matched)):
         px, py, pz, n0, n1, n2, nc, variance = matched[i]
@@ -193,15 +210,13 @@ def linearise(matched: F64, T_world_lidar: F64, noise2: float) -> Linearised:
         robust = (_KERNEL2 / (_KERNEL2 + r * r / s2)) ** 2
         weight = robust / s2
         matches += 1
-        total += robust
+        total += weight
+        score += robust
         for a in range(6):
             g[a] += weight * r * J[a]
             for b in range(a, 6):
                 H[a, b] += weight * J[a] * J[b]
-        for a in range(3):
-            for b in range(3):
-                N[a, b] += J[a] * J[b]
     for a in range(6):
         for b in range(a):
             H[a, b] = H[b, a]
-    return Linearised(H, g, N / max(matches, 1), matches, total)
+    return Linearised(H, g, matches, total, score)
