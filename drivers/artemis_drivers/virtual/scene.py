@@ -32,8 +32,8 @@ class Surface(NamedTuple):
 class Scene:
     """Triangles around the sensors; ``origin`` float64 (3,) of the float32 coordinates in ``surface``.
 
-    ``object_of`` int32 (m,) numbers the objects 0..k - 1 of the triangles; ``object_centre`` float64 (k, 3), local,
-    and ``object_radius`` (k,) enclose them.
+    ``object_of`` int32 (m,) numbers the objects 0..k - 1 of the triangles; ``object_centre`` float64 (k, 3),
+    local, and ``object_radius`` (k,) enclose them.
     """
 
     mesh: WorldMesh
