@@ -5,7 +5,9 @@ The filter (IMU, images) of a later version takes this place and keeps ``Odometr
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +23,7 @@ from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import DEGENERATE, Registration
 from artemis_edge.odometry.thin import Thinner, ThinScan, TimedPoints
 
+_START_FRAMES = 2  # what it takes to know a velocity
 _START_ROUNDS = 2  # the first scan is corrected with the motion found and the second registered again
 _GIVE_UP = 10  # frames lost in a row after which the map is begun anew at the predicted pose
 _EVICT_TRAVEL = 0.25  # share of the range travelled after which far voxels are looked for
@@ -47,7 +50,8 @@ class LidarOdometry:
     of the map.
     """
 
-    def __init__(self, config: OdometryConfig) -> None:
+    def __init__(self, config: OdometryConfig, start_twist: F64 | None = None) -> None:
+        """``start_twist`` (6,): how the sensor moves during the first scan, where that is known."""
         self.lost: dict[str, int] = {}
         self._config = config
         self._thinner = Thinner(config)
@@ -58,6 +62,18 @@ class LidarOdometry:
         self._imu = ImuSamples.empty()
         self._lost_in_a_row = 0
         self._evicted_at = np.zeros(3)
+        self._start_twist: F64 = np.zeros(6) if start_twist is None else start_twist
+
+    @classmethod
+    def looking_ahead(cls, config: OdometryConfig, frames: Iterable[SyncedFrame]) -> LidarOdometry:
+        """For a recording: two frames are tried, so that the first is corrected for the motion already.
+
+        Without this the first frame goes out as it was measured: its motion is known only after the second.
+        """
+        trial = cls(config)
+        for frame in islice(frames, _START_FRAMES):
+            trial.track(frame)
+        return cls(config, trial.twist)
 
     @property
     def twist(self) -> F64:
@@ -94,7 +110,9 @@ class LidarOdometry:
     def _seed(self, T_world_lidar: F64, stamp_ns: int, scan: ThinScan) -> None:
         """Begin the map with a scan, at a pose that holds at the frame's stamp."""
         rate = inertial.rate_during(self._imu, scan.stamp_ns)
-        twist = np.concatenate([np.zeros(3), np.zeros(3) if rate is None else rate])
+        twist = self._start_twist.copy()
+        if rate is not None:
+            twist[3:] = rate
         self._first = _First(T_world_lidar, (scan.stamp_ns - stamp_ns) * 1e-9, scan.dense)
         self._motion = Motion(self._first.at_middle(twist), scan.stamp_ns, twist)
         self._map.clear()
@@ -140,6 +158,7 @@ class LidarOdometry:
         tracked = self._tracked(frame)
         if self._lost_in_a_row >= _GIVE_UP and len(scan.dense.points):
             self._count("restarts")
+            self._start_twist = np.zeros(6)
             self._seed(tracked.T_world_lidar, frame.stamp_ns, scan)
             self._lost_in_a_row = 0
         return tracked
