@@ -26,7 +26,7 @@ $(READY): pyproject.toml constraints.txt
 	@echo "setting up $(VENV) (once; a minute or two)"
 	@$(PYTHON) -m venv $(VENV) || \
 	  { echo "python3 -m venv does not work here; on Debian and Ubuntu: apt install python3-venv"; exit 2; }
-	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --only-binary :all: -e '.[dev]'
+	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install -qq --only-binary :all: -e '.[dev]'
 	@touch $@
 	@echo "ready: $(BIN)/artemis-edge"
 

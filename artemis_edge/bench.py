@@ -59,13 +59,14 @@ def _measure(request: Request, plain: bool, make: MakeMapper) -> dict[str, Any]:
     statistics = RunStatistics(source.name, source.input_hz)
     with Interrupt() as interrupt, progress("measuring", plain) as report:
         warm_up_run(request.config, odometry, request.out, source, span, statistics, make)
-        mapper = make(request.config, odometry(), request.out)
+        tracker = odometry()
+        mapper = make(request.config, tracker, request.out)
         run = MappingRun(mapper, source, span, statistics)
         run.frames(report, interrupt, lambda frame: frame)
         run.flush()
     if run.stopped is not None or not statistics.frame_ms:
         raise RunError(f"{run.stopped or run.fault or 'no frame was mapped'}; nothing was measured")
-    count_losses(statistics, source, mapper)
+    count_losses(statistics, source, tracker, mapper)
     summary = statistics.summary()
     wanted = {
         "stages": statistics.stage_ms,

@@ -6,7 +6,7 @@ import gc
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -32,13 +32,17 @@ class Mapper(Protocol):
 
     stage_ms: dict[str, float]
     trajectory: list[tuple[int, F64]]
-    lost: dict[str, int]
+
+    @property
+    def lost(self) -> Mapping[str, int]:
+        """What the stages could not use, by reason."""
+        ...
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
         """All stages for one frame."""
         ...
 
-    def finish(self) -> None:
+    def finish(self) -> object:
         """Work that was postponed."""
         ...
 

@@ -87,14 +87,15 @@ def reprocess(
     with scratch(request.out) as pages:
         with Interrupt() as interrupt:
             warm_up_run(request.config, odometry, pages, source, span, statistics, make)
-            mapper = make(request.config, odometry(), pages)
+            tracker = odometry()
+            mapper = make(request.config, tracker, pages)
             run = MappingRun(mapper, source, span, statistics)
             photos = HeldOut(request.out, request.holdout)
             run.frames(report, interrupt, photos.take)
             if not statistics.frame_ms:
                 raise _nothing_mapped(run, source, span)
             run.flush()
-        count_losses(statistics, source, mapper)
+        count_losses(statistics, source, tracker, mapper)
         results = Results(request.out)
         outcome = _write(results, run, mapper, photos, statistics, evaluate)
     _complain(run, results, request.out)
@@ -142,10 +143,14 @@ def warm_up_run(
     gc.collect()
 
 
-def count_losses(statistics: RunStatistics, source: FrameSource, mapper: Mapper) -> None:
+def count_losses(statistics: RunStatistics, source: FrameSource, odometry: Odometry, mapper: Mapper) -> None:
     """What the input could not give and what the stages could not use."""
     statistics.add_lost(source.lost)
     statistics.add_lost(mapper.lost)
+    if isinstance(odometry, LidarOdometry):
+        statistics.add_lost(
+            {f"odometry_{reason.replace(' ', '_')}": n for reason, n in odometry.lost.items()}
+        )
     statistics.frames_dropped += source.lost.get("empty_file", 0)
 
 
