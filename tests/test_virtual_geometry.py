@@ -184,8 +184,8 @@ def test_blocks_near(world: World) -> None:
     assert list(world.blocks_near(-1e6, 5.0)) == [0]
 
 
-def test_atlas_is_seeded_tileable_and_mip_mapped() -> None:
-    one, two, three = build_atlas(1), build_atlas(1), build_atlas(2)
+def test_atlas_is_seeded_tileable_and_mip_mapped(atlas: TextureAtlas) -> None:
+    one, two, three = atlas, build_atlas(3), build_atlas(2)
     assert one.arrays.texels.tobytes() == two.arrays.texels.tobytes()
     assert one.arrays.texels.tobytes() != three.arrays.texels.tobytes()
     for name in ("asphalt", "plaster_a", "concrete", "macro"):
