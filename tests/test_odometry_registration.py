@@ -8,7 +8,7 @@ from artemis_edge.odometry import registration as reg
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.motion import Motion, Prediction
 from artemis_edge.odometry.plane_map import PlaneMap
-from artemis_edge.odometry.search import ball, guesses
+from artemis_edge.odometry.search import RINGS, ball, guesses
 from artemis_edge.odometry.thin import TimedPoints
 
 OFF = np.array([0.05, -0.04, 0.03, 0.01, -0.008, 0.012])
@@ -173,9 +173,9 @@ def test_ball_reaches_and_is_bounded():
     points = ball(1.0, 0.4)
     assert (points[0] == 0).all()
     assert np.linalg.norm(points, axis=1).max() == pytest.approx(1.0)
-    assert len(np.unique(points, axis=0)) == len(points) <= 7**3
+    assert len(np.unique(points, axis=0)) == len(points) <= (2 * RINGS + 1) ** 3
     np.testing.assert_array_equal(ball(0.0, 0.4), np.zeros((1, 3)))
-    assert len(ball(100.0, 0.1)) <= 7**3
+    assert len(ball(100.0, 0.1)) <= (2 * RINGS + 1) ** 3
 
 
 def test_guesses_shift_and_turn():

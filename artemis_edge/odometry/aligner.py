@@ -14,7 +14,7 @@ from artemis_edge.frames import F64
 from artemis_edge.odometry.motion import Prediction
 from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import Registration, arm_m, judge, register
-from artemis_edge.odometry.search import guesses
+from artemis_edge.odometry.search import RINGS, guesses
 from artemis_edge.odometry.thin import TimedPoints
 
 _MIN_MATCHES = 50  # fewer planes do not fix six numbers against outliers
@@ -61,7 +61,7 @@ class Aligner:
             best = max(best, found, key=_score)
             if best.score >= _GOOD * self._usual_score > 0.0:
                 return best
-        basin = _BASIN * self._config.voxel_m
+        basin = max(_BASIN * self._config.voxel_m, bound / RINGS)
         for guess in self._search(scan, prediction, basin):
             best = max(best, self._register(scan, prediction, guess, basin), key=_score)
         return best

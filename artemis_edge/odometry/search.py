@@ -12,12 +12,12 @@ import numpy as np
 from artemis_edge.frames import F64
 from artemis_edge.odometry import se3
 
-_RINGS = 3  # guesses at 1/3, 2/3 and 3/3 of the reach
+RINGS = 5  # guesses at fifths of the reach
 
 
 def ball(radius: float, spacing: float) -> F64:
-    """Lattice points (n, 3) within a radius, the origin first, at most ``2 * _RINGS + 1`` along an axis."""
-    steps = min(int(np.ceil(radius / spacing)), _RINGS) if radius > 0 else 0
+    """Lattice points (n, 3) within a radius, the origin first, at most ``2 * RINGS + 1`` along an axis."""
+    steps = min(int(np.ceil(radius / spacing)), RINGS) if radius > 0 else 0
     axis = np.arange(-steps, steps + 1) * (radius / max(steps, 1))
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     length = np.linalg.norm(grid, axis=1)
