@@ -109,6 +109,10 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     min_distance: Annotated[
         float, _float("Vertices nearer than this share of the point spacing are merged.", ge=0.0, le=1.0)
     ] = 0.6
+    least_evidence: Annotated[
+        float,
+        _float("Evidence within one and a half spacings that makes a vertex (1: one hit close by).", ge=0.0),
+    ] = 1.0
     short_edge: Annotated[
         float, _float("Edges up to this many point spacings are surface.", ge=1.0, le=4.0)
     ] = 2.0
@@ -116,6 +120,9 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
         float,
         _float("Edges up to this many point spacings are surface where seen well or flat.", ge=1.0, le=4.0),
     ] = 4.0
+    spacings: Annotated[
+        float, _float("Or edges up to this many times the local spacing of their vertices.", ge=1.0, le=4.0)
+    ] = 2.0
     well_seen: Annotated[
         float, _float("Evidence (hits at close range) of a vertex that carries a long edge.", gt=0.0)
     ] = 1.5
@@ -136,6 +143,9 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     longest_wait_frames: Annotated[
         int, Meta(description="Frames after which a waiting voxel is meshed or let go.", ge=1, le=1000)
     ] = 20
+    fresh: Annotated[
+        int, Meta(description="A patch is made anew when this many vertices are new.", ge=1)
+    ] = 4
     growth: Annotated[
         float, _float("A patch is made anew when its evidence grew by this factor (3: noise halves).", gt=0.0)
     ] = 3.0

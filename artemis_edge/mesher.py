@@ -20,7 +20,6 @@ from artemis_edge.block_store import (
     ALIVE,
     AT_MESH,
     BLOCK,
-    CELLS_PER_VOXEL,
     CHANGED,
     COUNT,
     FRESH,
@@ -37,7 +36,7 @@ from artemis_edge.cell_code import CODES, gather_cells, neighbour_shift
 from artemis_edge.config import MesherConfig
 from artemis_edge.delaunay import delaunay
 from artemis_edge.frames import F64, I32, U8
-from artemis_edge.voxel_map import VoxelMap, refresh_voxel
+from artemis_edge.voxel_map import RefreshRules, RefreshSpace, VoxelMap, refresh_space, refresh_voxel
 
 # Neighbours' vertices one cell around take part. Two cells halve the edges that neighbours disagree about, but cost
 # 60 % more and score no better, because ears close what is left (docs/tuning.md)
@@ -53,6 +52,7 @@ class Rules(NamedTuple):
 
     short_edge_m: float  # always accepted up to this length
     long_edge_m: float  # accepted up to this length between well-seen vertices
+    spacings: float  # or up to this many times the local spacing of the vertices
     well_seen: float  # evidence that makes a vertex well seen
     coplanar: float  # cosine between a triangle's normal and those of its vertices that makes up for evidence
     agreement: float  # least such cosine for any triangle
@@ -72,6 +72,7 @@ class Workspace(NamedTuple):
     position: F64  # (m, 3) relative to the voxel's corner
     normal: F64  # (m, 3)
     evidence: F64  # (m,)
+    spacing: F64  # (m,) local spacing [m]
     edge: U8  # (m, m) directed edges in use
     edges: I32  # (e, 2) list of them
     order: I32  # (m,)
@@ -88,7 +89,6 @@ class Workspace(NamedTuple):
     patch: NDArray[np.uint16]  # (MOST_TRIANGLES, 3) codes
     frame: F64  # (3, 3) rows: first axis, second axis, direction
     direction: F64  # (MOST_GROUPS, 3)
-    eigen: F64  # (6,)
     tally: NDArray[np.int64]  # (8,) 0 voxels, 1 vertices, 2 accepted, 3 edge taken, 4 too long, 5 normals, 6 ears
 
 
@@ -106,6 +106,7 @@ def workspace() -> Workspace:
         position=np.empty((m, 3)),
         normal=np.empty((m, 3)),
         evidence=np.empty(m),
+        spacing=np.empty(m),
         edge=np.zeros((m, m), np.uint8),
         edges=np.empty((27 * MOST_TRIANGLES, 2), np.int32),
         order=np.empty(m, np.int32),
@@ -122,7 +123,6 @@ def workspace() -> Workspace:
         patch=np.empty((MOST_TRIANGLES, 3), np.uint16),
         frame=np.empty((3, 3)),
         direction=np.empty((MOST_GROUPS, 3)),
-        eigen=np.empty(6),
         tally=np.zeros(8, np.int64),
     )
 
@@ -187,6 +187,7 @@ def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Worksp
             p[POSITION + 2] - z0,
         )
         w.normal[n, 0], w.normal[n, 1], w.normal[n, 2] = p[NORMAL], p[NORMAL + 1], p[NORMAL + 2]
+        w.spacing[n] = 0.0
         w.evidence[n] = store.evidence[s, COUNT]
         w.grid[code] = n
         n += 1
@@ -343,6 +344,7 @@ def _mesh_group(n: int, voxel_m: float, rules: Rules, w: Workspace, triangles: i
     m = _select(n, rules.group_cosine, w)
     if m >= 3:
         count = delaunay(w.x, w.y, m, w.corner, w.link, w.stack)
+        _measure_spacing(m, count, w)
         for t in range(count):
             i, j, k = w.corner[t, 0], w.corner[t, 1], w.corner[t, 2]
             if i >= m or j >= m or k >= m:
@@ -357,6 +359,31 @@ def _mesh_group(n: int, voxel_m: float, rules: Rules, w: Workspace, triangles: i
     for i in range(m):
         w.used[w.order[i]] = 1
     return triangles, edges
+
+
+@kernel
+def _measure_spacing(m: int, count: int, w: Workspace) -> None:
+    """Local spacing of each vertex: the length of its second shortest Delaunay edge.
+
+    The shortest alone would take a chance pair for the spacing.
+    """
+    for i in range(m):
+        w.spacing[w.order[i]] = 1.0e9
+        w.rank[w.order[i]] = 1.0e9
+    for t in range(count):
+        for k in range(3):
+            i, j = w.corner[t, k], w.corner[t, (k + 1) % 3]
+            if i < m and j < m:
+                # an inner edge is met from both sides, once in each direction: count it at its start
+                length2 = _edge2(w.position, w.order[i], w.order[j])
+                a = w.order[i]
+                if length2 < w.rank[a]:
+                    w.spacing[a] = w.rank[a]
+                    w.rank[a] = length2
+                elif length2 < w.spacing[a]:
+                    w.spacing[a] = length2
+    for i in range(m):
+        w.spacing[w.order[i]] = math.sqrt(w.spacing[w.order[i]])
 
 
 @kernel
@@ -408,7 +435,8 @@ def is_surface(a: int, b: int, c: int, rules: Rules, w: Workspace) -> bool:
         return False
     if longest > rules.short_edge_m * rules.short_edge_m:
         least = min(w.evidence[a], w.evidence[b], w.evidence[c])
-        if least < rules.well_seen and agreement < rules.coplanar:
+        usual = rules.spacings * min(w.spacing[a], w.spacing[b], w.spacing[c])
+        if longest > usual * usual and least < rules.well_seen and agreement < rules.coplanar:
             w.tally[4] += 1
             return False
     return True
@@ -483,6 +511,7 @@ class Schedule(NamedTuple):
 
     wait: int  # frames a voxel collects evidence before its first patch
     longest_wait: int  # frames after which it is decided whether waiting was worth it
+    fresh: int  # new vertices that are worth a new patch
     growth: float  # evidence that has grown by this factor is worth a new patch
     most: int  # voxels a frame
 
@@ -495,7 +524,7 @@ def is_due(store: Store, v: int, stamp: int, schedule: Schedule) -> bool:
         return False
     if row[AT_MESH] == 0:
         return row[PENDING] > 0
-    return row[FRESH] >= 4 or row[PENDING] >= schedule.growth * row[AT_MESH]
+    return row[FRESH] >= schedule.fresh or row[PENDING] >= schedule.growth * row[AT_MESH]
 
 
 @kernel
@@ -538,19 +567,18 @@ def mesh_batch(
     batch: I32,
     stamp: int,
     voxel_m: float,
-    plane_sigma_m: float,
-    min_distance: float,
+    refresh_rules: RefreshRules,
+    refresh: RefreshSpace,
     rules: Rules,
     w: Workspace,
 ) -> int:
     """Refresh the vertices of all voxels of the batch, then replace their patches; returns patches refused."""
-    cell_m = voxel_m / CELLS_PER_VOXEL
     for v in batch:
         row = store.voxel[v]
         row[AT_MESH] += max(row[PENDING], 1)
         row[PENDING] = 0
         row[FRESH] = 0
-        refresh_voxel(store, v, cell_m, plane_sigma_m, min_distance, stamp, w.neighbour, w.grid, w.code, w.eigen)
+        refresh_voxel(store, v, stamp, refresh_rules, refresh)
     refused = 0
     for v in batch:
         if not mesh_voxel(store, v, voxel_m, rules, w):
@@ -564,17 +592,24 @@ class Mesher:
 
     def __init__(self, config: MesherConfig, voxel_map: VoxelMap) -> None:
         self._map = voxel_map
-        self._min_distance = config.min_distance * voxel_map.cell_m
         cell = voxel_map.cell_m
+        self._refresh_rules = RefreshRules(
+            cell_m=cell,
+            plane_sigma_m=voxel_map.config.plane_sigma_m,
+            min_distance_m=config.min_distance * cell,
+            least_evidence=config.least_evidence,
+        )
+        self._refresh_space = refresh_space()
         self._rules = Rules(
             short_edge_m=config.short_edge * cell,
             long_edge_m=config.long_edge * cell,
+            spacings=config.spacings,
             well_seen=config.well_seen,
             coplanar=config.coplanar,
             agreement=config.agreement,
             group_cosine=config.group_cosine,
         )
-        self._schedule = Schedule(config.wait_frames, config.longest_wait_frames, config.growth, config.most_voxels)
+        self._schedule = Schedule(config.wait_frames, config.longest_wait_frames, config.fresh, config.growth, config.most_voxels)
         self._workspace = workspace()
         self._batch = np.empty(config.most_voxels, np.int32)
         self.refused = 0
@@ -603,8 +638,8 @@ class Mesher:
             self._batch[:n],
             stamp,
             self._map.config.voxel_m,
-            self._map.config.plane_sigma_m,
-            self._min_distance,
+            self._refresh_rules,
+            self._refresh_space,
             self._rules,
             self._workspace,
         )

@@ -8,6 +8,7 @@ eq. 2) for that vertex, so that every further scan averages the sensor noise dow
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from artemis_edge.block_store import (
     COUNT,
     EVIDENCE_ONLY,
     FRESH,
+    IX,
+    IY,
+    IZ,
     NORMAL,
     PENDING,
     REFUSED_POINTS,
@@ -35,10 +39,10 @@ from artemis_edge.block_store import (
     VIEW,
     Store,
 )
-from artemis_edge.cell_code import gather_cells
+from artemis_edge.cell_code import CODES, gather_cells
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.eigen3 import smallest_eigen3
-from artemis_edge.frames import F32, F64, I32, TrackedFrame
+from artemis_edge.frames import F32, F64, I32, U8, TrackedFrame
 
 POOL_FULL = -1
 # A cell with this much evidence no longer asks for re-meshing: its mean moves by less than sigma / 8
@@ -179,104 +183,158 @@ def _voxel_at(store: Store, x: int, y: int, z: int, stamp: int) -> int:
     return v if v >= 0 else bs.add_voxel(store, block, inner, x, y, z)
 
 
+class RefreshRules(NamedTuple):
+    """What makes a vertex; lengths in metres."""
+
+    cell_m: float
+    plane_sigma_m: float  # thickness up to which cells agree on a plane
+    min_distance_m: float  # living vertices are at least this far apart
+    least_evidence: float  # within one and a half cells
+
+
+class RefreshSpace(NamedTuple):
+    """Scratch of ``refresh_voxel``: the 6 x 6 x 6 cells around a voxel."""
+
+    neighbour: I32  # (27,)
+    grid: I32  # (CODES,) slot, then local index; -1 where nothing
+    code: I32  # (216,)
+    slot: I32  # (216,)
+    moment: F64  # (216, 13) about the voxel's corner
+    total: F64  # (13,)
+    eigen: F64  # (6,)
+
+
+def refresh_space() -> RefreshSpace:
+    """Fresh scratch memory."""
+    return RefreshSpace(
+        neighbour=np.empty(27, np.int32),
+        grid=np.full(CODES, -1, np.int32),
+        code=np.empty(1728, np.int32),
+        slot=np.empty(216, np.int32),
+        moment=np.zeros((216, 13)),
+        total=np.empty(13),
+        eigen=np.empty(6),
+    )
+
+
 @kernel
-def refresh_voxel(
-    store: Store,
-    v: int,
-    cell_m: float,
-    plane_sigma_m: float,
-    min_distance: float,
-    stamp: int,
-    neighbour: I32,
-    grid: I32,
-    code: I32,
-    eigen: F64,
-) -> None:
+def refresh_voxel(store: Store, v: int, stamp: int, rules: RefreshRules, w: RefreshSpace) -> None:
     """Recompute the vertices of one voxel from the moments of the 3 x 3 x 3 cells around each.
 
-    The vertex goes onto the common plane; where the cells do not agree on a plane (smallest eigenvalue above
-    ``plane_sigma_m`` squared: a crease, a bush) only by the share sigma^2 / lambda_0, because there a plane
-    would cut the corner (measured: ungated vertices are worse than raw ones at creases). A cell becomes a vertex
-    when no living vertex is nearer than ``min_distance``; ``grid`` (CODES,) must come and leaves as -1.
+    A cell becomes a vertex when the evidence around it reaches ``least_evidence`` and no living vertex is nearer
+    than ``min_distance_m``.
     """
-    evidence, vertex, state = store.evidence, store.vertex, store.state
-    bs.neighbours27(store, v, neighbour)
-    n = gather_cells(store, neighbour, 1, grid, code)
-    x0, y0, z0 = store.voxel[v, 0] * 4, store.voxel[v, 1] * 4, store.voxel[v, 2] * 4
+    state = store.state
+    bs.neighbours27(store, v, w.neighbour)
+    n = gather_cells(store, w.neighbour, 1, w.grid, w.code)
     for i in range(n):
-        X, Y, Z = (code[i] >> 10) - 12, ((code[i] >> 5) & 31) - 12, (code[i] & 31) - 12
+        w.slot[i] = w.grid[w.code[i]]
+        w.grid[w.code[i]] = i
+        _move_moments(store.evidence, w.slot[i], w.code[i], rules.cell_m, w.moment, i)
+    x0, y0, z0 = (
+        store.voxel[v, IX] * 4 * rules.cell_m,
+        store.voxel[v, IY] * 4 * rules.cell_m,
+        store.voxel[v, IZ] * 4 * rules.cell_m,
+    )
+    for i in range(n):
+        X, Y, Z = (w.code[i] >> 10) - 12, ((w.code[i] >> 5) & 31) - 12, (w.code[i] & 31) - 12
         if ((X | Y | Z) & ~3) != 0:
+            break  # own cells come first
+        s = w.slot[i]
+        if w.moment[i, 0] == 0.0:  # carved away and not seen again
             continue
-        s = grid[code[i]]
-        e = evidence[s]
-        if e[COUNT] == 0.0:  # carved away and not seen again
-            continue
-        if state[s] == CARVED and not is_seen_through(e):
+        if state[s] == CARVED and not is_seen_through(store.evidence[s]):
             state[s] = EVIDENCE_ONLY
-        inverse = 1.0 / e[COUNT]
-        mx, my, mz = e[SUM] * inverse, e[SUM + 1] * inverse, e[SUM + 2] * inverse
-        N, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
-        xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        vx, vy, vz = 0.0, 0.0, 0.0
-        for dx in range(-1, 2):
-            for dy in range(-1, 2):
-                for dz in range(-1, 2):
-                    t = grid[code[i] + (dx << 10) + (dy << 5) + dz]
-                    if t < 0:
-                        continue
-                    f = evidence[t]
-                    k = f[COUNT]
-                    ox, oy, oz = dx * cell_m, dy * cell_m, dz * cell_m
-                    ux, uy, uz = f[SUM], f[SUM + 1], f[SUM + 2]
-                    N += k
-                    sx += ux + k * ox
-                    sy += uy + k * oy
-                    sz += uz + k * oz
-                    xx += f[SQUARE] + 2.0 * ux * ox + k * ox * ox
-                    xy += f[SQUARE + 1] + ux * oy + uy * ox + k * ox * oy
-                    xz += f[SQUARE + 2] + ux * oz + uz * ox + k * ox * oz
-                    yy += f[SQUARE + 3] + 2.0 * uy * oy + k * oy * oy
-                    yz += f[SQUARE + 4] + uy * oz + uz * oy + k * oy * oz
-                    zz += f[SQUARE + 5] + 2.0 * uz * oz + k * oz * oz
-                    vx += f[VIEW]
-                    vy += f[VIEW + 1]
-                    vz += f[VIEW + 2]
-        inverse = 1.0 / N
-        gx, gy, gz = sx * inverse, sy * inverse, sz * inverse
-        smallest_eigen3(
-            xx * inverse - gx * gx,
-            xy * inverse - gx * gy,
-            xz * inverse - gx * gz,
-            yy * inverse - gy * gy,
-            yz * inverse - gy * gz,
-            zz * inverse - gz * gz,
-            eigen,
-        )
-        nx, ny, nz = eigen[0], eigen[1], eigen[2]
-        l0, l1 = max(eigen[3], 0.0), max(eigen[4], 0.0)
-        if nx * vx + ny * vy + nz * vz < 0.0:
-            nx, ny, nz = -nx, -ny, -nz
-        if l1 > 4.0 * l0 and l1 > 1e-8:
-            # a plane: the points spread at least twice as far along it as across it
-            sigma2 = plane_sigma_m * plane_sigma_m
-            share = 1.0 if l0 <= sigma2 else sigma2 / l0
-            d = share * ((mx - gx) * nx + (my - gy) * ny + (mz - gz) * nz)
-            mx, my, mz = mx - d * nx, my - d * ny, mz - d * nz
-        else:
-            # no plane: the best known direction is where it was seen from
-            r = math.sqrt(vx * vx + vy * vy + vz * vz) + 1e-12
-            nx, ny, nz = vx / r, vy / r, vz / r
-        p = vertex[s]
-        p[POSITION] = (x0 + X + 0.5) * cell_m + mx
-        p[POSITION + 1] = (y0 + Y + 0.5) * cell_m + my
-        p[POSITION + 2] = (z0 + Z + 0.5) * cell_m + mz
-        p[NORMAL], p[NORMAL + 1], p[NORMAL + 2] = nx, ny, nz
-        p[ROUGHNESS] = math.sqrt(l0)
-        if state[s] == EVIDENCE_ONLY and _is_apart(vertex, state, grid, code[i], s, min_distance):
+        _sum_around(w.grid, w.code[i], w.moment, w.total)
+        p = store.vertex[s]
+        _fit_vertex(w.moment[i], w.total, rules.plane_sigma_m, w.eigen, p)
+        p[POSITION] += x0
+        p[POSITION + 1] += y0
+        p[POSITION + 2] += z0
+        if (
+            state[s] == EVIDENCE_ONLY
+            and w.total[0] >= rules.least_evidence
+            and _is_apart(store.vertex, state, w.grid, w.slot, w.code[i], s, rules.min_distance_m)
+        ):
             state[s] = ALIVE
-            _tell_neighbours(store, neighbour, X, Y, Z, stamp)
+            _tell_neighbours(store, w.neighbour, X, Y, Z, stamp)
     for i in range(n):
-        grid[code[i]] = -1
+        w.grid[w.code[i]] = -1
+
+
+@kernel
+def _move_moments(evidence: F32, s: int, code: int, cell_m: float, moment: F64, i: int) -> None:
+    """Moments of a cell about the voxel's corner instead of the cell's centre: then sums are plain additions."""
+    e = evidence[s]
+    m = moment[i]
+    k, ux, uy, uz = np.float64(e[COUNT]), np.float64(e[SUM]), np.float64(e[SUM + 1]), np.float64(e[SUM + 2])
+    ox = ((code >> 10) - 11.5) * cell_m
+    oy = (((code >> 5) & 31) - 11.5) * cell_m
+    oz = ((code & 31) - 11.5) * cell_m
+    m[0] = k
+    m[1], m[2], m[3] = ux + k * ox, uy + k * oy, uz + k * oz
+    m[4] = e[SQUARE] + 2.0 * ux * ox + k * ox * ox
+    m[5] = e[SQUARE + 1] + ux * oy + uy * ox + k * ox * oy
+    m[6] = e[SQUARE + 2] + ux * oz + uz * ox + k * ox * oz
+    m[7] = e[SQUARE + 3] + 2.0 * uy * oy + k * oy * oy
+    m[8] = e[SQUARE + 4] + uy * oz + uz * oy + k * oy * oz
+    m[9] = e[SQUARE + 5] + 2.0 * uz * oz + k * oz * oz
+    m[10], m[11], m[12] = e[VIEW], e[VIEW + 1], e[VIEW + 2]
+
+
+@kernel
+def _sum_around(grid: I32, at: int, moment: F64, total: F64) -> None:
+    """Moments of the 3 x 3 x 3 cells around ``at``."""
+    for q in range(13):
+        total[q] = 0.0
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                t = grid[at + (dx << 10) + (dy << 5) + dz]
+                if t >= 0:
+                    for q in range(13):
+                        total[q] += moment[t, q]
+
+
+@kernel
+def _fit_vertex(own: F64, total: F64, plane_sigma_m: float, eigen: F64, p: F32) -> None:
+    """Position, normal and roughness of one vertex, about the voxel's corner (E_geometry of eq. 2).
+
+    The vertex goes onto the common plane; where the cells do not agree on a plane (smallest eigenvalue above
+    sigma^2: a crease, a bush) only by the share sigma^2 / lambda_0, because there a plane would cut the corner
+    (measured: ungated vertices are worse than raw ones at creases).
+    """
+    k = 1.0 / own[0]
+    mx, my, mz = own[1] * k, own[2] * k, own[3] * k
+    k = 1.0 / total[0]
+    gx, gy, gz = total[1] * k, total[2] * k, total[3] * k
+    smallest_eigen3(
+        total[4] * k - gx * gx,
+        total[5] * k - gx * gy,
+        total[6] * k - gx * gz,
+        total[7] * k - gy * gy,
+        total[8] * k - gy * gz,
+        total[9] * k - gz * gz,
+        eigen,
+    )
+    nx, ny, nz = eigen[0], eigen[1], eigen[2]
+    vx, vy, vz = total[10], total[11], total[12]
+    if nx * vx + ny * vy + nz * vz < 0.0:
+        nx, ny, nz = -nx, -ny, -nz
+    l0, l1 = max(eigen[3], 0.0), max(eigen[4], 0.0)
+    if l1 > 4.0 * l0 and l1 > 1e-8:
+        # a plane: the points spread at least twice as far along it as across it
+        sigma2 = plane_sigma_m * plane_sigma_m
+        share = 1.0 if l0 <= sigma2 else sigma2 / l0
+        d = share * ((mx - gx) * nx + (my - gy) * ny + (mz - gz) * nz)
+        mx, my, mz = mx - d * nx, my - d * ny, mz - d * nz
+    else:
+        # no plane: the best known direction is where it was seen from
+        k = 1.0 / (math.sqrt(vx * vx + vy * vy + vz * vz) + 1e-12)
+        nx, ny, nz = vx * k, vy * k, vz * k
+    p[POSITION], p[POSITION + 1], p[POSITION + 2] = mx, my, mz
+    p[NORMAL], p[NORMAL + 1], p[NORMAL + 2] = nx, ny, nz
+    p[ROUGHNESS] = math.sqrt(l0)
 
 
 @kernel
@@ -304,14 +362,14 @@ def is_seen_through(e: F32) -> bool:
 
 
 @kernel
-def _is_apart(vertex: F32, state: np.ndarray, grid: I32, at: int, s: int, min_distance: float) -> bool:
+def _is_apart(vertex: F32, state: U8, grid: I32, slot: I32, at: int, s: int, min_distance: float) -> bool:
     p = vertex[s]
     for dx in range(-1, 2):
         for dy in range(-1, 2):
             for dz in range(-1, 2):
-                t = grid[at + (dx << 10) + (dy << 5) + dz]
-                if t >= 0 and t != s and state[t] == ALIVE:
-                    q = vertex[t]
+                i = grid[at + (dx << 10) + (dy << 5) + dz]
+                if i >= 0 and slot[i] != s and state[slot[i]] == ALIVE:
+                    q = vertex[slot[i]]
                     gap = (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
                     if gap < min_distance * min_distance:
                         return False
