@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from artemis_edge import health
 from artemis_edge.config import Config
 from artemis_edge.datasets import open_input
 from artemis_edge.errors import RunError
@@ -53,6 +54,7 @@ def _virtual_walk(folder: Path, frames: int, plain: bool) -> Path:
 
 
 def _measure(request: Request, plain: bool, make: MakeMapper) -> dict[str, Any]:
+    health.restart_peak()
     source = open_input(request.input, request.config.input)
     span = frame_span(source, request)
     odometry = choose_odometry(source, request, span)
@@ -66,6 +68,7 @@ def _measure(request: Request, plain: bool, make: MakeMapper) -> dict[str, Any]:
         run.flush()
     if run.stopped is not None or not statistics.frame_ms:
         raise RunError(f"{run.stopped or run.fault or 'no frame was mapped'}; nothing was measured")
+    statistics.peak_rss_mb = health.peak_resident_mb() or None
     count_losses(statistics, source, tracker, mapper)
     summary = statistics.summary()
     wanted = {

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 from pathlib import Path
 
 MB = 1e6
 _KIB = 1024.0
+_RESET_PEAK = "5"  # proc(5), /proc/pid/clear_refs
 
 
 def resident_mb() -> float:
     """Resident memory of this process now, MB of 1e6 bytes; 0 where the system does not say."""
     return _proc_field(Path("/proc/self/status"), "VmRSS:")
+
+
+def restart_peak() -> None:
+    """Measure the peak of resident memory from here on, where the system can."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text(_RESET_PEAK)
+
+
+def peak_resident_mb() -> float:
+    """Largest resident memory since ``restart_peak`` (or ever), MB; 0 where the system does not say."""
+    return _proc_field(Path("/proc/self/status"), "VmHWM:")
 
 
 def available_memory_mb() -> float:

@@ -96,7 +96,7 @@ class MappingRun:
     ) -> None:
         """All frames. One that cannot be read or mapped is counted and skipped; a full disk ends the run."""
         with _quiet_collector():
-            for done, (frame, fault) in enumerate(self._readable()):
+            for done, (frame, fault) in enumerate(readable(self._source, self._span)):
                 if interrupt.asked:
                     total = len(self._span)
                     self._stop(f"interrupted after {done} of {total} frames", total - done)
@@ -127,19 +127,6 @@ class MappingRun:
         stamps = np.array([stamp for stamp, _ in poses], np.int64)
         return Trajectory(stamps, np.array([T for _, T in poses], np.float64).reshape(-1, 4, 4))
 
-    def _readable(self) -> Iterator[tuple[SyncedFrame | None, InputError | None]]:
-        """Every frame, or why it cannot be read."""
-        index = self._span.start
-        while index < self._span.stop:
-            try:
-                for frame in self._source.frames(index, self._span.stop):
-                    index += 1
-                    yield frame, None
-                return
-            except InputError as error:
-                index += 1
-                yield None, error
-
     def _one(self, frame: SyncedFrame, prepare: Callable[[SyncedFrame], SyncedFrame]) -> InputError | None:
         try:
             frame = prepare(frame)
@@ -169,6 +156,20 @@ class MappingRun:
         times = self._statistics.frame_ms
         pace = f"{np.median(times[-20:]):.0f} ms a frame, " if times else ""
         return f"{pace}{health.resident_mb():.0f} MB"
+
+
+def readable(source: FrameSource, span: range) -> Iterator[tuple[SyncedFrame | None, InputError | None]]:
+    """Every frame of ``span``, or why it cannot be read."""
+    index = span.start
+    while index < span.stop:
+        try:
+            for frame in source.frames(index, span.stop):
+                index += 1
+                yield frame, None
+            return
+        except InputError as error:
+            index += 1
+            yield None, error
 
 
 def warm_up(make: Callable[[], Mapper], source: FrameSource, span: range, frames: int) -> float:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from artemis_edge import health
 from artemis_edge.config import Config, to_toml
 from artemis_edge.datasets import lidar_poses, open_input
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.export.glb import write_glb
 from artemis_edge.export.ply import Mesh
-from artemis_edge.frames import FrameSource, Odometry, Trajectory
-from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, warm_up
+from artemis_edge.frames import FrameSource, Odometry, SyncedFrame, Trajectory
+from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, readable, warm_up
 from artemis_edge.odometry.given_poses import GivenPoses
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.progress import Report, silent
@@ -79,6 +80,7 @@ def reprocess(
     Raises InputError when nothing can be done, RunError when the run ended early or a result could not be
     written; its sentence says what was kept.
     """
+    health.restart_peak()
     source = open_input(request.input, request.config.input)
     span = frame_span(source, request)
     odometry = choose_odometry(source, request, span)
@@ -122,7 +124,11 @@ def choose_odometry(source: FrameSource, request: Request, span: range) -> Calla
     if source.poses is not None and len(source.poses) and not request.own_odometry:
         own = source.poses
         return lambda: GivenPoses(own)
-    return lambda: LidarOdometry(request.config.odometry)
+    return lambda: LidarOdometry.looking_ahead(request.config.odometry, _frames(source, span))
+
+
+def _frames(source: FrameSource, span: range) -> Iterator[SyncedFrame]:
+    return (frame for frame, _ in readable(source, span) if frame is not None)
 
 
 def warm_up_run(
@@ -176,6 +182,7 @@ def _write(
         return None
     whole = mesh
     results.attempt("mesh.glb", lambda path: write_glb(path, whole))
+    statistics.peak_rss_mb = health.peak_resident_mb() or None
     evaluation = evaluate(whole, trajectory) if evaluate is not None else None
     return results.attempt(
         "report.html",

@@ -77,7 +77,8 @@ def test_recording_cut_off_in_its_header(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     os.truncate(recording, 30)
-    assert "walk.mcap" in refused(capsys, 2, "reprocess", recording, "--out", tmp_path / "out")
+    sentence = refused(capsys, 2, "reprocess", recording, "--out", tmp_path / "out")
+    assert "holds no LiDAR clouds" in sentence
 
 
 def test_points_that_are_not_finite(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -134,9 +135,17 @@ def test_bad_settings(
     assert sentence in refused(capsys, 2, "reprocess", kitti, "--out", tmp_path / "out", option, value)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is unreadable for root")
-def test_file_without_permission(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recording.chmod(0)
+def test_file_without_permission(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain_open = Path.open
+
+    def refuse(path: Path, *arguments: Any, **options: Any) -> Any:
+        if path == recording:  # nothing is unreadable for root: permissions cannot be taken for real
+            raise PermissionError(13, "Permission denied", str(path))
+        return plain_open(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", refuse)
     assert "Permission denied" in refused(capsys, 2, "reprocess", recording, "--out", tmp_path / "out")
 
 

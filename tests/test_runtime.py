@@ -266,6 +266,11 @@ def test_photographs_beyond_the_trajectory_are_counted(tmp_path: Path) -> None:
 
 def test_readings_of_the_machine(tmp_path: Path) -> None:
     assert health.resident_mb() > 10.0
+    health.restart_peak()
+    before = health.peak_resident_mb()
+    block = np.ones(20_000_000, np.uint8)
+    assert health.peak_resident_mb() >= before + 15.0
+    assert block[-1] == 1
     assert health.available_memory_mb() > 10.0
     assert health.processors() >= 1
     assert health.free_disk_mb(tmp_path / "not" / "there") > 0.0
