@@ -58,6 +58,7 @@ class Outcome:
 
     out: Path
     report: dict[str, Any]
+    statistics: RunStatistics
     trajectory: Trajectory
     warnings: list[str]
 
@@ -102,7 +103,7 @@ def reprocess(
         outcome = _write(results, run, mapper, photos, statistics, evaluate)
     _complain(run, results, request.out)
     warnings = [*source.warnings, *_skipped(run, statistics)]
-    return Outcome(request.out, outcome or {}, run.trajectory(), warnings)
+    return Outcome(request.out, outcome or {}, statistics, run.trajectory(), warnings)
 
 
 def frame_span(source: FrameSource, request: Request) -> range:
