@@ -78,8 +78,9 @@ class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
         float, _float("Points nearer than this are the operator or the housing [m].", ge=0.0, le=10.0)
     ] = 0.8
     max_range_m: Annotated[
-        float, _float("Points farther than this are not mapped [m].", gt=0.0, le=1000.0)
-    ] = 100.0
+        float,
+        _float("Points farther than this are not mapped: they weigh less than 0.1 [m].", gt=0.0, le=1000.0),
+    ] = 60.0
     noise_range_m: Annotated[
         float,
         _float("Range where the error from beam angle equals the ranging error: 2 cm / 1 mrad [m].", gt=0.0),

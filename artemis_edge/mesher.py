@@ -466,14 +466,33 @@ def _fill_ears(n: int, d: F64, rules: Rules, w: Workspace, triangles: int, edges
             j = w.hole[j, 2]
             if x == b or w.edge[a, x] or w.edge[x, b] or not (w.own[a] or w.own[b] or w.own[x]):
                 continue
-            if _turn(b, a, x, d, w.position) <= 0.0 or not is_surface(b, a, x, rules, w):
-                continue
-            if _is_empty(b, a, x, n, d, w.position):
+            if _is_loop(w, b, x) or (
+                _turn(b, a, x, d, w.position) > 0.0
+                and is_surface(b, a, x, rules, w)
+                and _is_empty(b, a, x, n, d, w.position)
+            ):
+                if _edge2(w.position, b, x) > rules.long_edge_m * rules.long_edge_m:
+                    continue
                 triangles, edges = _accept(b, a, x, w, triangles, edges)
                 w.tally[6] += 1
                 if w.edge[b, x] == 0:
                     holes = _add_hole(w, b, x, holes)
     return triangles, edges
+
+
+@kernel
+def _is_loop(w: Workspace, b: int, x: int) -> bool:
+    """Whether the free edges b-a, a-x close to a loop of three or four: then the hole is smaller than a triangle
+    or two and there is nothing to ask."""
+    if w.edge[b, x]:
+        return True
+    j = w.hole_of[x]
+    while j >= 0:
+        y = w.hole[j, 1]
+        j = w.hole[j, 2]
+        if w.edge[x, y] == 0 and w.edge[b, y] and w.edge[y, b] == 0:
+            return True
+    return False
 
 
 @kernel
@@ -529,9 +548,9 @@ def is_due(store: Store, v: int, stamp: int, schedule: Schedule) -> bool:
 
 @kernel
 def is_worth(store: Store, v: int) -> bool:
-    """Whether anything would visibly change: new vertices, or twice the evidence."""
+    """Whether anything would visibly change: new vertices, or twice the evidence (the first time: any)."""
     row = store.voxel[v]
-    return row[FRESH] > 0 or row[PENDING] >= row[AT_MESH]
+    return row[FRESH] > 1 or row[PENDING] >= row[AT_MESH]
 
 
 @kernel
@@ -574,13 +593,13 @@ def mesh_batch(
 ) -> int:
     """Refresh the vertices of all voxels of the batch, then replace their patches; returns patches refused."""
     for v in batch:
-        row = store.voxel[v]
-        row[AT_MESH] += max(row[PENDING], 1)
-        row[PENDING] = 0
-        row[FRESH] = 0
         refresh_voxel(store, v, stamp, refresh_rules, refresh)
     refused = 0
     for v in batch:
+        row = store.voxel[v]
+        row[AT_MESH] += max(row[PENDING], 1)
+        row[PENDING] = 0
+        row[FRESH] = 0  # what the batch's other voxels told it while they were refreshed is in its patch now
         if not mesh_voxel(store, v, voxel_m, rules, w):
             refused += 1
         store.block[store.voxel[v, BLOCK], CHANGED] = stamp

@@ -75,8 +75,9 @@ class Pipeline:
         return {reason: n for reason, n in counts.items() if n}
 
     def write_mesh(self, path: Path) -> Mesh:
-        """Write ``mesh.ply`` and return the mesh."""
-        return write_mesh(path, self.pager, self.config.mesher.smallest_island)
+        """Write ``mesh.ply``, finished, and return the mesh."""
+        rules = self.config.mesher
+        return write_mesh(path, self.pager, rules.long_edge * self.voxel_map.cell_m, rules.smallest_island)
 
     def save(self, folder: Path) -> int:
         """Write what reopens the map; returns its size in bytes."""
