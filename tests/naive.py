@@ -1,0 +1,163 @@
+"""Slow, obvious twins of the map's kernels, and the small worlds that its tests share."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from artemis_edge.config import MesherConfig, VoxelMapConfig
+from artemis_edge.export.mesh import Mesh
+from artemis_edge.frames import F32, F64, I64, DeskewedScan, TrackedFrame
+from artemis_edge.map_writer import gather_mesh
+from artemis_edge.mesher import Mesher
+from artemis_edge.paging import Pager
+from artemis_edge.voxel_map import VoxelMap
+
+Cell = tuple[int, int, int]
+
+
+def accumulate(
+    points: F32, T: F64, origin: F64, cell_m: float, least_m: float, most_m: float, noise_m: float
+) -> dict[Cell, F64]:
+    """Sums of ``insert_points`` by cell: count, sum (3), squares (6), view (3), about the cell's centre."""
+    cells: dict[Cell, F64] = defaultdict(lambda: np.zeros(13))
+    for p in points.astype(np.float64):
+        distance = float(np.linalg.norm(p - origin))
+        if not (np.isfinite(p).all() and least_m <= distance <= most_m):
+            continue
+        world = T[:3, :3] @ p + T[:3, 3]
+        cell = np.floor(world / cell_m)
+        d = world - (cell + 0.5) * cell_m
+        w = 1.0 / (1.0 + (distance / noise_m) ** 2)
+        view = T[:3, :3] @ (origin - p) / max(distance, 1e-6)
+        square = np.outer(d, d)[np.triu_indices(3)]
+        x, y, z = cell.astype(int).tolist()
+        cells[x, y, z] += w * np.concatenate(([1.0], d, square, view))
+    return dict(cells)
+
+
+def sum_around(cells: dict[Cell, F64], at: Cell) -> F64:
+    """Sum of the rows of the 27 cells around ``at``."""
+    total = np.zeros(13)
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            for dz in (-1, 0, 1):
+                total += cells.get((at[0] + dx, at[1] + dy, at[2] + dz), np.zeros(13))
+    return total
+
+
+def pixel(direction: F64, pixels: int) -> tuple[int, int, int]:
+    """Cube face (+x, -x, +y, -y, +z, -z), row and column of a direction: equal parts of the face's edge."""
+    axis = int(np.argmax(np.abs(direction)))
+    others = [k for k in range(3) if k != axis]
+    face = 2 * axis + (0 if direction[axis] > 0 else 1)
+    column, row = ((direction[k] / abs(direction[axis]) + 1.0) / 2.0 * pixels for k in others)
+    return face, min(math.floor(row), pixels - 1), min(math.floor(column), pixels - 1)
+
+
+def nearest_ranges(points: F32, origin: F64, pixels: int) -> dict[tuple[int, int, int], float]:
+    """Smallest range by pixel."""
+    out: dict[tuple[int, int, int], float] = {}
+    for p in points.astype(np.float64) - origin:
+        if np.isfinite(p).all() and p.any():
+            at = pixel(p, pixels)
+            out[at] = min(out.get(at, math.inf), float(np.linalg.norm(p)))
+    return out
+
+
+def directed_edges(triangles: I64) -> Counter[tuple[int, int]]:
+    """How often each directed edge is used."""
+    return Counter((int(t[k]), int(t[(k + 1) % 3])) for t in triangles for k in range(3))
+
+
+def assert_manifold(triangles: I64) -> None:
+    """No directed edge twice, no triangle that names a vertex twice: at most two triangles an edge, which turn alike."""
+    again = {edge: n for edge, n in directed_edges(triangles).items() if n > 1}
+    assert not again, f"{len(again)} directed edges used more than once"
+    assert all(len(set(t)) == 3 for t in triangles.tolist())
+
+
+def free_edges(triangles: I64) -> list[tuple[int, int]]:
+    """Directed edges that no triangle uses the other way round."""
+    edges = directed_edges(triangles)
+    return [edge for edge in edges if (edge[1], edge[0]) not in edges]
+
+
+def all_triangles(pager: Pager) -> I64:
+    """Vertex names of all triangles of a map, (t, 3)."""
+    parts = [page.triangle_ids() for page in pager.pages()]
+    return np.concatenate(parts) if parts else np.empty((0, 3), np.int64)
+
+
+def living_vertices(pager: Pager) -> dict[int, F32]:
+    """Position by name of every living vertex of a map."""
+    out: dict[int, F32] = {}
+    for page in pager.pages():
+        alive = page.alive()
+        out.update(zip(page.vertex_ids()[alive].tolist(), page.vertex[alive, :3], strict=True))
+    return out
+
+
+def area(mesh: Mesh) -> float:
+    """Sum of the triangles' areas [m2]."""
+    p, q, r = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    return float(np.linalg.norm(np.cross(q - p, r - p), axis=1).sum() / 2)
+
+
+def face_normals(mesh: Mesh) -> F64:
+    """Unit normals of the triangles (t, 3)."""
+    p, q, r = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    n = np.cross(q - p, r - p)
+    return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-15)
+
+
+def frame_of(points: F64, sensor: Iterable[float] = (0.0, 0.0, 0.0), index: int = 0) -> TrackedFrame:
+    """A frame of world points (n, 3) seen from ``sensor``; the lidar's axes are those of the world."""
+    T = np.eye(4)
+    T[:3, 3] = list(sensor)
+    local = (np.asarray(points, np.float64).reshape(-1, 3) - T[:3, 3]).astype(np.float32)
+    return TrackedFrame(index, index * 100_000_000, T, (DeskewedScan(local, np.zeros(3)),))
+
+
+class SmallMapper:
+    """A map of the smallest memory with its mesher and pager, fed with world points."""
+
+    def __init__(
+        self,
+        folder: Path,
+        voxel_map: VoxelMapConfig | None = None,
+        mesher: MesherConfig | None = None,
+        budget_bytes: float = 20e6,
+    ) -> None:
+        self.voxel_map = VoxelMap(voxel_map or VoxelMapConfig(), budget_bytes)
+        self.store = self.voxel_map.store
+        self.mesher = Mesher(mesher or MesherConfig(), self.voxel_map)
+        self.pager = Pager(self.store, folder)
+        self.stamp = 0
+
+    def add(self, points: F64, sensor: Iterable[float] = (0.0, 0.0, 0.0)) -> None:
+        """One frame."""
+        self.stamp += 1
+        active = self.voxel_map.insert(frame_of(points, sensor, self.stamp), self.stamp)
+        self.mesher.update(active, self.stamp)
+
+    def finish(self) -> Mesh:
+        """Mesh what waits; the mesh with all islands."""
+        self.mesher.flush(self.stamp)
+        return gather_mesh(self.pager, 1)
+
+
+def rectangle(
+    rng: np.random.Generator, corner: Iterable[float], u: Iterable[float], v: Iterable[float], per_m2: float, sigma: float
+) -> F64:
+    """Random points (n, 3) on the parallelogram ``corner + a u + b v`` with Gaussian noise along its normal."""
+    c, u, v = (np.array(list(x), np.float64) for x in (corner, u, v))
+    normal = np.cross(u, v)
+    size = float(np.linalg.norm(normal))
+    n = int(size * per_m2)
+    ab = rng.uniform(size=(n, 2))
+    return c + ab[:, :1] * u + ab[:, 1:] * v + rng.normal(0.0, sigma, (n, 1)) * normal / size
