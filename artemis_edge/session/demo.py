@@ -22,6 +22,8 @@ from artemis_edge.session.truth import evaluate_against_world, read_reference
 from artemis_edge.trajectory import inverse, read_tum
 
 SESSION = "session"
+# Measuring within 10 cm thins the reference to 5 cm anyway.
+_SETTINGS = {"reference_spacing_m": "0.04"}
 # How far an Avia's points lie close enough together to carry a mesh at the default spacing.
 NEAR_M = 30.0
 
@@ -33,7 +35,7 @@ def demo(world: str, seconds: float, seed: int, out: Path) -> str:
     prepare(session)
     say(f"recording a walk of {seconds:g} s through the virtual world '{world}'")
     with progress("recording") as report:
-        made = simulate(world, seed, seconds, "avia", session, progress=report)
+        made = simulate(world, seed, seconds, "avia", session, _SETTINGS, report)
     say("mapping it by its own odometry (the truth is only for measuring)")
     request = Request(session, out, own_odometry=True)
     with progress("mapping") as report:
