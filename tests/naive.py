@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from artemis_edge.config import MesherConfig, VoxelMapConfig
-from artemis_edge.export.mesh import Mesh
+from artemis_edge.export.mesh import Mesh, bare_mesh
 from artemis_edge.frames import F32, F64, I64, DeskewedScan, TrackedFrame
-from artemis_edge.map_writer import gather_mesh
 from artemis_edge.mesher import Mesher
 from artemis_edge.paging import Pager
 from artemis_edge.voxel_map import VoxelMap
@@ -102,6 +101,15 @@ def living_vertices(pager: Pager) -> dict[int, F32]:
     return out
 
 
+def raw_mesh(pager: Pager) -> Mesh:
+    """All triangles as they are in the patches, nothing closed, trimmed or left out."""
+    living = living_vertices(pager)
+    row = {name: k for k, name in enumerate(living)}
+    faces = [[row[name] for name in t] for t in all_triangles(pager).tolist()]
+    vertices = np.array(list(living.values()), np.float32).reshape(-1, 3)
+    return bare_mesh(vertices, np.array(faces, np.int32).reshape(-1, 3))
+
+
 def area(mesh: Mesh) -> float:
     """Sum of the triangles' areas [m2]."""
     p, q, r = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
@@ -146,9 +154,9 @@ class SmallMapper:
         self.mesher.update(active, self.stamp)
 
     def finish(self) -> Mesh:
-        """Mesh what waits; the mesh with all islands."""
+        """Mesh what waits; the mesh of the patches as they are."""
         self.mesher.flush(self.stamp)
-        return gather_mesh(self.pager, 1)
+        return raw_mesh(self.pager)
 
 
 def rectangle(
