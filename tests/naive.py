@@ -80,6 +80,11 @@ def assert_manifold(triangles: I64) -> None:
     assert all(len(set(t)) == 3 for t in triangles.tolist())
 
 
+def assert_no_doubles(triangles: I64) -> None:
+    """No two triangles of the same three vertices: neither copies nor back to back."""
+    assert len(np.unique(np.sort(triangles, axis=1), axis=0)) == len(triangles)
+
+
 def free_edges(triangles: I64) -> list[tuple[int, int]]:
     """Directed edges that no triangle uses the other way round."""
     edges = directed_edges(triangles)
