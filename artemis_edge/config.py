@@ -109,7 +109,7 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
     min_distance: Annotated[
         float, _float("Vertices nearer than this share of the point spacing are merged.", ge=0.0, le=1.0)
-    ] = 0.6
+    ] = 0.5
     least_evidence: Annotated[
         float,
         _float("Evidence within one and a half spacings that makes a vertex (1: one hit close by).", ge=0.0),
@@ -121,9 +121,6 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
         float,
         _float("Edges up to this many point spacings are surface where seen well or flat.", ge=1.0, le=4.0),
     ] = 4.0
-    spacings: Annotated[
-        float, _float("Or edges up to this many times the local spacing of their vertices.", ge=1.0, le=4.0)
-    ] = 2.0
     well_seen: Annotated[
         float, _float("Evidence (hits at close range) of a vertex that carries a long edge.", gt=0.0)
     ] = 1.5
@@ -152,10 +149,10 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 3.0
     most_voxels: Annotated[
         int, Meta(description="Voxels meshed in one frame at most; the rest waits.", ge=1)
-    ] = 1500
+    ] = 600
     smallest_island: Annotated[
         int, Meta(description="Islands of fewer triangles are left out of the finished mesh.", ge=1)
-    ] = 10
+    ] = 4
 
 
 class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):

@@ -52,7 +52,6 @@ class Rules(NamedTuple):
 
     short_edge_m: float  # always accepted up to this length
     long_edge_m: float  # accepted up to this length between well-seen vertices
-    spacings: float  # or up to this many times the local spacing of the vertices
     well_seen: float  # evidence that makes a vertex well seen
     coplanar: float  # cosine between a triangle's normal and those of its vertices that makes up for evidence
     agreement: float  # least such cosine for any triangle
@@ -72,7 +71,6 @@ class Workspace(NamedTuple):
     position: F64  # (m, 3) relative to the voxel's corner
     normal: F64  # (m, 3)
     evidence: F64  # (m,)
-    spacing: F64  # (m,) local spacing [m]
     edge: U8  # (m, m) directed edges in use
     edges: I32  # (e, 2) list of them
     order: I32  # (m,)
@@ -106,7 +104,6 @@ def workspace() -> Workspace:
         position=np.empty((m, 3)),
         normal=np.empty((m, 3)),
         evidence=np.empty(m),
-        spacing=np.empty(m),
         edge=np.zeros((m, m), np.uint8),
         edges=np.empty((27 * MOST_TRIANGLES, 2), np.int32),
         order=np.empty(m, np.int32),
@@ -187,7 +184,6 @@ def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Worksp
             p[POSITION + 2] - z0,
         )
         w.normal[n, 0], w.normal[n, 1], w.normal[n, 2] = p[NORMAL], p[NORMAL + 1], p[NORMAL + 2]
-        w.spacing[n] = 0.0
         w.evidence[n] = store.evidence[s, COUNT]
         w.grid[code] = n
         n += 1
@@ -344,7 +340,6 @@ def _mesh_group(n: int, voxel_m: float, rules: Rules, w: Workspace, triangles: i
     m = _select(n, rules.group_cosine, w)
     if m >= 3:
         count = delaunay(w.x, w.y, m, w.corner, w.link, w.stack)
-        _measure_spacing(m, count, w)
         for t in range(count):
             i, j, k = w.corner[t, 0], w.corner[t, 1], w.corner[t, 2]
             if i >= m or j >= m or k >= m:
@@ -359,31 +354,6 @@ def _mesh_group(n: int, voxel_m: float, rules: Rules, w: Workspace, triangles: i
     for i in range(m):
         w.used[w.order[i]] = 1
     return triangles, edges
-
-
-@kernel
-def _measure_spacing(m: int, count: int, w: Workspace) -> None:
-    """Local spacing of each vertex: the length of its second shortest Delaunay edge.
-
-    The shortest alone would take a chance pair for the spacing.
-    """
-    for i in range(m):
-        w.spacing[w.order[i]] = 1.0e9
-        w.rank[w.order[i]] = 1.0e9
-    for t in range(count):
-        for k in range(3):
-            i, j = w.corner[t, k], w.corner[t, (k + 1) % 3]
-            if i < m and j < m:
-                # an inner edge is met from both sides, once in each direction: count it at its start
-                length2 = _edge2(w.position, w.order[i], w.order[j])
-                a = w.order[i]
-                if length2 < w.rank[a]:
-                    w.spacing[a] = w.rank[a]
-                    w.rank[a] = length2
-                elif length2 < w.spacing[a]:
-                    w.spacing[a] = length2
-    for i in range(m):
-        w.spacing[w.order[i]] = math.sqrt(w.spacing[w.order[i]])
 
 
 @kernel
@@ -435,8 +405,7 @@ def is_surface(a: int, b: int, c: int, rules: Rules, w: Workspace) -> bool:
         return False
     if longest > rules.short_edge_m * rules.short_edge_m:
         least = min(w.evidence[a], w.evidence[b], w.evidence[c])
-        usual = rules.spacings * min(w.spacing[a], w.spacing[b], w.spacing[c])
-        if longest > usual * usual and least < rules.well_seen and agreement < rules.coplanar:
+        if least < rules.well_seen and agreement < rules.coplanar:
             w.tally[4] += 1
             return False
     return True
@@ -536,10 +505,10 @@ class Schedule(NamedTuple):
 
 
 @kernel
-def is_due(store: Store, v: int, stamp: int, schedule: Schedule) -> bool:
+def is_due(store: Store, v: int, waited: int, schedule: Schedule) -> bool:
     """Whether enough is new: a first patch after ``wait``, then new vertices or evidence grown ``growth`` fold."""
     row = store.voxel[v]
-    if stamp - row[QUEUED] < schedule.wait and row[FRESH] < 64:
+    if waited < schedule.wait and row[FRESH] < 64:
         return False
     if row[AT_MESH] == 0:
         return row[PENDING] > 0
@@ -555,27 +524,33 @@ def is_worth(store: Store, v: int) -> bool:
 
 @kernel
 def choose_batch(store: Store, stamp: int, schedule: Schedule, everything: bool, batch: I32) -> int:
-    """Take voxels that are due off the queue, oldest first, at most ``schedule.most``; returns how many.
+    """Take voxels that are due off the queue, at most as many as ``batch`` holds; returns how many.
 
-    Voxels not due go back; those that waited longest without being worth it leave the queue and keep their
-    pending counts.
+    Those that have no patch yet come first, so that new surface shows at once; within a kind the oldest first.
     """
     n = 0
+    if not everything:
+        n = _choose(store, stamp, schedule, False, True, batch, n)
+    return _choose(store, stamp, schedule, everything, False, batch, n)
+
+
+@kernel
+def _choose(
+    store: Store, stamp: int, schedule: Schedule, everything: bool, only_first: bool, batch: I32, n: int
+) -> int:
+    """One round of the queue. Voxels not due go back; those that waited longest without being worth it leave the
+    queue and keep their pending counts."""
     for _ in range(store.counter[QUEUE_LEN]):
-        if n == batch.shape[0]:
-            break
         v = bs.dequeue(store)
         row = store.voxel[v]
-        late = everything or stamp - row[QUEUED] >= schedule.longest_wait
-        if (late and is_worth(store, v)) or (not late and is_due(store, v, stamp, schedule)):
+        since = row[QUEUED]
+        row[QUEUED] = 0
+        late = everything or stamp - since >= schedule.longest_wait
+        wanted = is_worth(store, v) if late else is_due(store, v, stamp - since, schedule)
+        if wanted and n < batch.shape[0] and not (only_first and row[AT_MESH] > 0):
             batch[n] = v
             n += 1
-            row[QUEUED] = 0
-        elif late:
-            row[QUEUED] = 0
-        else:
-            since = row[QUEUED]
-            row[QUEUED] = 0
+        elif wanted or not late:
             bs.enqueue(store, v, since)
     return n
 
@@ -622,7 +597,6 @@ class Mesher:
         self._rules = Rules(
             short_edge_m=config.short_edge * cell,
             long_edge_m=config.long_edge * cell,
-            spacings=config.spacings,
             well_seen=config.well_seen,
             coplanar=config.coplanar,
             agreement=config.agreement,
@@ -636,25 +610,26 @@ class Mesher:
     def update(self, active: I32, stamp: int) -> None:
         """Mesh what is due after the voxels ``active`` received points in frame ``stamp``."""
         enqueue_all(self._map.store, active, stamp)
-        self._mesh(choose_batch(self._map.store, stamp, self._schedule, False, self._batch), stamp)
+        n = choose_batch(self._map.store, stamp, self._schedule, False, self._batch)
+        self._mesh(self._batch[:n], stamp)
 
     def flush(self, stamp: int) -> None:
         """Mesh everything that was postponed. Meshing can promote neighbours, hence until nothing is left."""
-        while True:
-            n = choose_batch(self._map.store, stamp, self._schedule, True, self._batch)
-            if n == 0:
-                return
-            self._mesh(n, stamp)
+        while self.waiting:
+            batch = np.empty(self.waiting, np.int32)
+            self._mesh(batch[: choose_batch(self._map.store, stamp, self._schedule, True, batch)], stamp)
 
     @property
     def waiting(self) -> int:
         """Voxels in the queue."""
         return int(self._map.store.counter[QUEUE_LEN])
 
-    def _mesh(self, n: int, stamp: int) -> None:
+    def _mesh(self, batch: I32, stamp: int) -> None:
+        # block by block: voxels of a block share cells and neighbours, which are then in the cache
+        batch = batch[np.argsort(self._map.store.voxel[batch, BLOCK], kind="stable")]
         self.refused += mesh_batch(
             self._map.store,
-            self._batch[:n],
+            batch,
             stamp,
             self._map.config.voxel_m,
             self._refresh_rules,

@@ -22,6 +22,10 @@ from artemis_edge.block_store import (
     CONFIRMED,
     COUNT,
     FRESH,
+    IX,
+    IY,
+    IZ,
+    SUM,
     THROUGH,
     Store,
 )
@@ -31,6 +35,7 @@ from artemis_edge.voxel_map import VoxelMap, is_seen_through
 
 PIXELS = 256  # a face; 0.45 degrees a pixel in its middle, the line spacing of common LiDARs
 FAR = np.float32(1.0e6)
+EVERY = 2  # frames between two judgements; each takes every second block
 
 
 class RangeCube:
@@ -60,7 +65,7 @@ class FreeSpace:
     def carve(self, frame: TrackedFrame, stamp: int) -> int:
         """Count looks through and confirmations of a frame; returns how many vertices were carved."""
         gone = 0
-        if self._config.free_space:
+        if self._config.free_space and stamp % EVERY == 0:
             for scan in frame.scans:
                 self._cube.look(scan)
                 gone += carve(
@@ -119,9 +124,9 @@ def carve(
     slope: float,
     stamp: int,
 ) -> int:
-    """Judge the vertices of the blocks around the sensor; every second block a frame. Returns how many went.
+    """Judge the cells of the blocks around the sensor; every second block a frame. Returns how many lost their evidence.
 
-    A vertex at range r was looked through when the range seen there exceeds r + margin + slope r; the margin is
+    A cell whose points lie at range r was looked through when the range seen there exceeds r + margin + slope r; the margin is
     a voxel, the slope the error of a range image's pixel at grazing surfaces.
     """
     R, t = T_world_lidar[:3, :3], T_world_lidar[:3, 3]
@@ -132,13 +137,13 @@ def carve(
     for bx in range(math.floor((ox - reach_m) / block_m), math.floor((ox + reach_m) / block_m) + 1):
         for by in range(math.floor((oy - reach_m) / block_m), math.floor((oy + reach_m) / block_m) + 1):
             for bz in range(math.floor((oz - reach_m) / block_m), math.floor((oz + reach_m) / block_m) + 1):
-                if (bx + by + bz + stamp) & 1:
+                if (bx + by + bz + stamp // EVERY) & 1:
                     continue
                 key = bs.block_key(bx, by, bz)
                 at = bs.find_slot(store.hash_key, key)
                 if store.hash_key[at] == key:
                     gone += _carve_block(
-                        store, store.hash_slot[at], cube, R, ox, oy, oz, margin_m, slope, stamp
+                        store, store.hash_slot[at], cube, R, ox, oy, oz, block_m / 32.0, margin_m, slope, stamp
                     )
     store.counter[CARVED_CELLS] += gone
     return gone
@@ -146,20 +151,24 @@ def carve(
 
 @kernel
 def _carve_block(
-    store: Store, block: int, cube: F32, R: F64, ox: float, oy: float, oz: float, margin_m: float, slope: float, stamp: int
+    store: Store, block: int, cube: F32, R: F64, ox: float, oy: float, oz: float, cell_m: float, margin_m: float, slope: float, stamp: int
 ) -> int:
     gone = 0
     for inner in range(512):
         v = store.block_voxel[block, inner]
         if v < 0:
             continue
-        before = gone
+        gone_here = 0
         for c in range(64):
             s = store.voxel_cell[v, c]
-            if s < 0 or store.state[s] != ALIVE:
+            if s < 0 or store.evidence[s, COUNT] == 0.0:
                 continue
-            p = store.vertex[s]
-            dx, dy, dz = p[0] - ox, p[1] - oy, p[2] - oz
+            e = store.evidence[s]
+            # the mean of the cell's points: a vertex may not have been made of them yet
+            k = 1.0 / e[COUNT]
+            dx = (4 * store.voxel[v, IX] + (c >> 4) + 0.5) * cell_m + k * e[SUM] - ox
+            dy = (4 * store.voxel[v, IY] + ((c >> 2) & 3) + 0.5) * cell_m + k * e[SUM + 1] - oy
+            dz = (4 * store.voxel[v, IZ] + (c & 3) + 0.5) * cell_m + k * e[SUM + 2] - oz
             face, row, column = pixel(
                 R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz,
                 R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz,
@@ -171,17 +180,17 @@ def _carve_block(
             if seen >= FAR:
                 continue
             r = math.sqrt(dx * dx + dy * dy + dz * dz)
-            e = store.evidence[s]
             if seen > r + margin_m + slope * r:
                 e[THROUGH] += 1.0
                 if is_seen_through(e):
+                    gone_here += store.state[s] == ALIVE
                     store.state[s] = CARVED
                     for k in range(COUNT, THROUGH):
                         e[k] = 0.0
                     gone += 1
             elif seen > r - margin_m:
                 e[CONFIRMED] += 1.0
-        if gone > before:
+        if gone_here > 0:
             _remesh_around(store, v, stamp)
     return gone
 

@@ -199,8 +199,8 @@ class RefreshSpace(NamedTuple):
     grid: I32  # (CODES,) slot, then local index; -1 where nothing
     code: I32  # (216,)
     slot: I32  # (216,)
-    moment: F64  # (216, 13) about the voxel's corner
-    total: F64  # (13,)
+    moment: F64  # (216, 16) about the voxel's corner
+    total: F64  # (16,)
     eigen: F64  # (6,)
 
 
@@ -211,8 +211,8 @@ def refresh_space() -> RefreshSpace:
         grid=np.full(CODES, -1, np.int32),
         code=np.empty(1728, np.int32),
         slot=np.empty(216, np.int32),
-        moment=np.zeros((216, 13)),
-        total=np.empty(13),
+        moment=np.zeros((216, 16)),
+        total=np.empty(16),
         eigen=np.empty(6),
     )
 
@@ -284,15 +284,15 @@ def _move_moments(evidence: F32, s: int, code: int, cell_m: float, moment: F64, 
 
 @kernel
 def _sum_around(grid: I32, at: int, moment: F64, total: F64) -> None:
-    """Moments of the 3 x 3 x 3 cells around ``at``."""
-    for q in range(13):
+    """Moments of the 3 x 3 x 3 cells around ``at``; 16 columns of which 13 are used fill whole vector registers."""
+    for q in range(16):
         total[q] = 0.0
     for dx in range(-1, 2):
         for dy in range(-1, 2):
             for dz in range(-1, 2):
                 t = grid[at + (dx << 10) + (dy << 5) + dz]
                 if t >= 0:
-                    for q in range(13):
+                    for q in range(16):
                         total[q] += moment[t, q]
 
 
