@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from artemis_edge.config import MesherConfig, VoxelMapConfig
+from artemis_edge import paging
+from artemis_edge.config import Config, MesherConfig, VoxelMapConfig
 from artemis_edge.export.mesh import Mesh, bare_mesh
-from artemis_edge.frames import F32, F64, I64, DeskewedScan, TrackedFrame
+from artemis_edge.frames import F32, F64, I64, DeskewedScan, LidarScan, SyncedFrame, TrackedFrame
 from artemis_edge.mesher import Mesher
-from artemis_edge.paging import Pager
+from artemis_edge.paging import PageFile, Pager
+from artemis_edge.pipeline import BASE_MB, Pipeline
 from artemis_edge.voxel_map import VoxelMap
 
 Cell = tuple[int, int, int]
@@ -174,3 +178,61 @@ def rectangle(
     n = int(size * per_m2)
     ab = rng.uniform(size=(n, 2))
     return c + ab[:, :1] * u + ab[:, 1:] * v + rng.normal(0.0, sigma, (n, 1)) * normal / size
+
+
+class KnownPoses:
+    """Odometry that is told the sensor's place in each frame; nothing to correct."""
+
+    def __init__(self, places: list[tuple[float, float, float]]) -> None:
+        self.places = places
+
+    def track(self, frame: SyncedFrame) -> TrackedFrame:
+        T = np.eye(4)
+        T[:3, 3] = self.places[frame.index]
+        scans = tuple(DeskewedScan(scan.points, np.zeros(3)) for scan in frame.scans)
+        return TrackedFrame(frame.index, frame.stamp_ns, T, scans)
+
+
+def corridor(places: list[tuple[float, float, float]], points: int = 1500, reach_m: float = 4.0) -> list[SyncedFrame]:
+    """One scan at each place of a corridor along x: two walls, floor and ceiling, 2.1 m wide and high."""
+    frames = []
+    for index, place in enumerate(places):
+        rng = np.random.default_rng(index)
+        p = rng.uniform((-reach_m, -1.05, -0.95), (reach_m, 1.05, 1.15), (points, 3)) + (place[0], 0.0, 0.0)
+        side = np.arange(points) % 4
+        p[side == 0, 1], p[side == 1, 1], p[side == 2, 2], p[side == 3, 2] = -1.05, 1.05, -0.95, 1.15
+        p += rng.normal(0.0, 0.005, p.shape)
+        scan = LidarScan((p - place).astype(np.float32), index * 100_000_000)
+        frames.append(SyncedFrame(index, index * 100_000_000, (scan,)))
+    return frames
+
+
+@contextmanager
+def closing_page_files() -> Iterator[None]:
+    """Closes, at the end, the files of all pagers made meanwhile: a pipeline does so only when it saves its map."""
+    made: list[PageFile] = []
+
+    class Listed(PageFile):
+        def __init__(self, folder: Path) -> None:
+            super().__init__(folder)
+            made.append(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paging, "PageFile", Listed)
+        yield
+    for file in made:
+        file.close()
+
+
+def walk(length_m: float, step_m: float) -> list[tuple[float, float, float]]:
+    """Places along x, there and back."""
+    there = [(float(x), 0.0, 0.0) for x in np.arange(0.0, length_m, step_m)]
+    return [*there, *reversed(there)]
+
+
+def small_pipeline(folder: Path, places: list[tuple[float, float, float]], budget_mb: int = 0, **mesher: int) -> Pipeline:
+    """A pipeline with ``budget_mb`` of map memory (0: the smallest there is)."""
+    config = Config(
+        voxel_map=VoxelMapConfig(memory_budget_mb=BASE_MB + budget_mb), mesher=MesherConfig(**mesher)
+    )
+    return Pipeline(config, KnownPoses(places), folder)
