@@ -169,7 +169,12 @@ class SmallMapper:
 
 
 def rectangle(
-    rng: np.random.Generator, corner: Iterable[float], u: Iterable[float], v: Iterable[float], per_m2: float, sigma: float
+    rng: np.random.Generator,
+    corner: Iterable[float],
+    u: Iterable[float],
+    v: Iterable[float],
+    per_m2: float,
+    sigma: float,
 ) -> F64:
     """Random points (n, 3) on the parallelogram ``corner + a u + b v`` with Gaussian noise along its normal."""
     c, u, v = (np.array(list(x), np.float64) for x in (corner, u, v))
@@ -193,7 +198,9 @@ class KnownPoses:
         return TrackedFrame(frame.index, frame.stamp_ns, T, scans)
 
 
-def corridor(places: list[tuple[float, float, float]], points: int = 1500, reach_m: float = 4.0) -> list[SyncedFrame]:
+def corridor(
+    places: list[tuple[float, float, float]], points: int = 1500, reach_m: float = 4.0
+) -> list[SyncedFrame]:
     """One scan at each place of a corridor along x: two walls, floor and ceiling, 2.1 m wide and high."""
     frames = []
     for index, place in enumerate(places):
@@ -230,7 +237,9 @@ def walk(length_m: float, step_m: float) -> list[tuple[float, float, float]]:
     return [*there, *reversed(there)]
 
 
-def small_pipeline(folder: Path, places: list[tuple[float, float, float]], budget_mb: int = 0, **mesher: int) -> Pipeline:
+def small_pipeline(
+    folder: Path, places: list[tuple[float, float, float]], budget_mb: int = 0, **mesher: int
+) -> Pipeline:
     """A pipeline with ``budget_mb`` of map memory (0: the smallest there is)."""
     config = Config(
         voxel_map=VoxelMapConfig(memory_budget_mb=BASE_MB + budget_mb), mesher=MesherConfig(**mesher)

@@ -66,7 +66,11 @@ def test_removal_keeps_runs_of_colliding_keys_reachable(steps: list[tuple[bool, 
         elif key in twin:
             del twin[key]
             bs._remove_key(hash_key, hash_slot, at)
-        found = {k: int(hash_slot[bs.find_slot(hash_key, k)]) for k in keys if hash_key[bs.find_slot(hash_key, k)] == k}
+        found = {
+            k: int(hash_slot[bs.find_slot(hash_key, k)])
+            for k in keys
+            if hash_key[bs.find_slot(hash_key, k)] == k
+        }
         assert found == twin
         assert (hash_key != bs.EMPTY_KEY).sum() == len(twin)
 
@@ -137,7 +141,9 @@ def test_live_patches_never_overlap_and_keep_their_triangles() -> None:
 
 def test_full_triangle_pool_refuses_and_keeps_the_old_patch() -> None:
     store = bs.allocate(SMALLEST)
-    voxels = list(_add_voxels(store, {(x, y, z) for x in range(8) for y in range(8) for z in range(8)}).values())
+    voxels = list(
+        _add_voxels(store, {(x, y, z) for x in range(8) for y in range(8) for z in range(8)}).values()
+    )
     results = [bs.set_patch(store, v, _patch(512, v), 512) for v in voxels]
     assert results.count(True) == len(store.triangle) // 512
     last = voxels[results.index(False) - 1]

@@ -76,7 +76,9 @@ def test_random_points_give_qhulls_triangles(n: int) -> None:
 
 @pytest.mark.parametrize("shape", [(2, 2), (3, 3), (5, 7), (10, 10)])
 @pytest.mark.parametrize("turn", [0.0, 0.3])
-def test_grid_is_covered_once_although_every_square_is_cocircular(shape: tuple[int, int], turn: float) -> None:
+def test_grid_is_covered_once_although_every_square_is_cocircular(
+    shape: tuple[int, int], turn: float
+) -> None:
     rows, columns = shape
     grid = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), -1).reshape(-1, 2) * 0.05
     c, s = np.cos(turn), np.sin(turn)

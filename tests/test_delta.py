@@ -31,7 +31,9 @@ class Viewer:
         for k, block in enumerate(map(tuple, d.block.tolist())):
             rows = slice(d.vertex_start[k], d.vertex_start[k + 1])
             self.vertices[block] = dict(zip(d.vertex_id[rows].tolist(), d.position[rows], strict=True))
-            self.triangles[block] = list(map(tuple, d.triangles[d.triangle_start[k] : d.triangle_start[k + 1]].tolist()))
+            self.triangles[block] = list(
+                map(tuple, d.triangles[d.triangle_start[k] : d.triangle_start[k + 1]].tolist())
+            )
 
     def assert_shows(self, pipeline: Pipeline, missing_allowed: int = 0) -> None:
         shown = sorted(t for block in self.triangles.values() for t in block)
@@ -77,7 +79,9 @@ def test_all_deltas_together_are_the_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="_settle_ears takes triangles from a neighbour's block without marking that block CHANGED"
+    strict=True,
+    raises=AssertionError,
+    reason="_settle_ears takes triangles from a neighbour's block without marking that block CHANGED",
 )
 def test_all_deltas_together_are_exactly_the_map(tmp_path: Path) -> None:
     places = naive.walk(40.0, 0.5)
@@ -85,7 +89,11 @@ def test_all_deltas_together_are_exactly_the_map(tmp_path: Path) -> None:
     _run(pipeline, places).assert_shows(pipeline)
 
 
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="make_room sends blocks to disk that changed and were not told yet")
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="make_room sends blocks to disk that changed and were not told yet",
+)
 def test_blocks_on_disk_were_told_before_they_went(tmp_path: Path) -> None:
     places = naive.walk(70.0, 0.5)[:140]
     pipeline = naive.small_pipeline(tmp_path, places)

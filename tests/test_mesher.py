@@ -19,7 +19,9 @@ LONG_EDGE_M = MesherConfig().long_edge * CELL_M
 EDGE_SLACK_M = 0.1  # a vertex may still move by its noise after its patch was made
 
 
-def _map(folder: Path, frames: list[F64], sensor: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> naive.SmallMapper:
+def _map(
+    folder: Path, frames: list[F64], sensor: tuple[float, float, float] = (0.0, 0.0, 1.0)
+) -> naive.SmallMapper:
     mapper = naive.SmallMapper(folder)
     for points in frames:
         mapper.add(points, sensor)
@@ -47,7 +49,9 @@ def _edge_lengths(mesh: Mesh) -> F64:
 
 def _wall(seed: int, x: float, frames: int = 5, sigma: float = 0.005) -> list[F64]:
     rng = np.random.default_rng(seed)
-    return [naive.rectangle(rng, (x, -1.7, -0.7), (0, 3.4, 0), (0, 0, 3.4), 400, sigma) for _ in range(frames)]
+    return [
+        naive.rectangle(rng, (x, -1.7, -0.7), (0, 3.4, 0), (0, 0, 3.4), 400, sigma) for _ in range(frames)
+    ]
 
 
 @pytest.mark.parametrize("x", [3.05, 3.13, 3.3, -2.9])
@@ -71,7 +75,9 @@ def test_plane_has_no_holes_and_its_own_area(tmp_path: Path, x: float, sigma: fl
 
 
 @pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="ownership by the moving centroid loses triangles on a voxel's face; remove when owned by cells"
+    strict=True,
+    raises=AssertionError,
+    reason="ownership by the moving centroid loses triangles on a voxel's face; remove when owned by cells",
 )
 @pytest.mark.parametrize("x", [3.2, -4.0])
 def test_plane_on_the_border_of_voxels_is_whole_too(tmp_path: Path, x: float) -> None:
@@ -149,7 +155,10 @@ def test_gap_wider_than_the_longest_edge_stays_open(tmp_path: Path) -> None:
     gap = LONG_EDGE_M + 2 * CELL_M
     frames = [
         np.concatenate(
-            [naive.rectangle(rng, (3.1, y, 0.1), (0, 1.2, 0), (0, 0, 2), 400, 0.005) for y in (-1.2 - gap / 2, gap / 2)]
+            [
+                naive.rectangle(rng, (3.1, y, 0.1), (0, 1.2, 0), (0, 0, 2), 400, 0.005)
+                for y in (-1.2 - gap / 2, gap / 2)
+            ]
         )
         for _ in range(5)
     ]
@@ -160,7 +169,9 @@ def test_gap_wider_than_the_longest_edge_stays_open(tmp_path: Path) -> None:
 
 
 BACK_FACES = pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="_fill_ears closes the outer loop of a lone triangle by its back; remove when it asks for _turn"
+    strict=True,
+    raises=AssertionError,
+    reason="_fill_ears closes the outer loop of a lone triangle by its back; remove when it asks for _turn",
 )
 
 

@@ -85,7 +85,10 @@ def test_names_of_vertices_are_their_cells(tmp_path: Path) -> None:
 def test_page_of_several_blocks_is_their_pages_in_order(tmp_path: Path) -> None:
     mapper = _scene(tmp_path)
     slots = mapper.pager.resident()
-    whole, parts = pack(mapper.store, slots), [pack(mapper.store, slots[k : k + 1]) for k in range(len(slots))]
+    whole, parts = (
+        pack(mapper.store, slots),
+        [pack(mapper.store, slots[k : k + 1]) for k in range(len(slots))],
+    )
     for field in dataclasses.fields(Page):
         joined = np.concatenate([getattr(p, field.name) for p in parts])
         np.testing.assert_array_equal(getattr(whole, field.name), joined, err_msg=field.name)
@@ -190,7 +193,9 @@ def test_long_corridor_in_little_memory_is_the_corridor_in_much(tmp_path: Path) 
 
 
 @pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="triangle pool: rooms of another grade count as free but cannot be used; fill() stays below 85 %"
+    strict=True,
+    raises=AssertionError,
+    reason="triangle pool: rooms of another grade count as free but cannot be used; fill() stays below 85 %",
 )
 def test_a_pool_that_is_not_full_refuses_no_patch(tmp_path: Path) -> None:
     places = naive.walk(70.0, 0.5)
@@ -202,7 +207,9 @@ def test_a_pool_that_is_not_full_refuses_no_patch(tmp_path: Path) -> None:
 
 
 @pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="a voxel is meshed although a neighbour's block is on disk, whose edges it cannot see"
+    strict=True,
+    raises=AssertionError,
+    reason="a voxel is meshed although a neighbour's block is on disk, whose edges it cannot see",
 )
 def test_meshing_beside_a_block_on_disk_stays_manifold(tmp_path: Path) -> None:
     mapper = _scene(tmp_path)

@@ -102,7 +102,9 @@ def test_a_box_that_went_away_is_carved_and_the_wall_stays(tmp_path: Path) -> No
     assert _near_box(living) == 0
     assert _near_box(mesh.vertices) == 0
     # no triangle of any patch names what is gone
-    assert set(naive.all_triangles(mapper.pager).ravel().tolist()) <= naive.living_vertices(mapper.pager).keys()
+    assert (
+        set(naive.all_triangles(mapper.pager).ravel().tolist()) <= naive.living_vertices(mapper.pager).keys()
+    )
     naive.assert_manifold(naive.all_triangles(mapper.pager))
     assert naive.area(mesh) == pytest.approx(32.0, rel=0.05)
 

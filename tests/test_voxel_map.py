@@ -45,7 +45,13 @@ def _assert_equal(voxel_map: VoxelMap, twin: dict[naive.Cell, F64]) -> None:
 
 def _naive(scan: DeskewedScan, T: F64) -> dict[naive.Cell, F64]:
     return naive.accumulate(
-        scan.points, T, scan.origin, CONFIG.voxel_m / 4, CONFIG.min_range_m, CONFIG.max_range_m, CONFIG.noise_range_m
+        scan.points,
+        T,
+        scan.origin,
+        CONFIG.voxel_m / 4,
+        CONFIG.min_range_m,
+        CONFIG.max_range_m,
+        CONFIG.noise_range_m,
     )
 
 
@@ -131,7 +137,9 @@ def test_evidence_of_a_cell_stops_growing() -> None:
 def test_full_memory_refuses_points_and_counts_them() -> None:
     voxel_map = VoxelMap(CONFIG, 1.0)
     room = len(voxel_map.store.voxel)
-    grid = np.stack(np.meshgrid(np.arange(20), np.arange(20), np.arange(20), indexing="ij"), -1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(np.arange(20), np.arange(20), np.arange(20), indexing="ij"), -1).reshape(
+        -1, 3
+    )
     points = grid * CONFIG.voxel_m + 1.0
     for stamp in (1, 2):
         touched = voxel_map.insert(naive.frame_of(points), stamp)
@@ -255,7 +263,9 @@ def test_moved_moments_are_those_of_the_points_themselves() -> None:
             vm._move_moments(store.evidence, s, code, cell_m, moment, c)
     w = 1 / (1 + (np.linalg.norm(points - (3, 0, 0), axis=1) / CONFIG.noise_range_m) ** 2)
     square = np.einsum("i,ij,ik->jk", w, points, points)[np.triu_indices(3)]
-    np.testing.assert_allclose(moment.sum(axis=0)[:10], [w.sum(), *(w @ points), *square], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        moment.sum(axis=0)[:10], [w.sum(), *(w @ points), *square], rtol=1e-3, atol=1e-3
+    )
 
 
 def test_new_vertices_tell_only_the_neighbours_that_see_them() -> None:
