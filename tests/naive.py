@@ -78,7 +78,7 @@ def directed_edges(triangles: I64) -> Counter[tuple[int, int]]:
 
 
 def assert_manifold(triangles: I64) -> None:
-    """No directed edge twice, no triangle that names a vertex twice: at most two triangles an edge, which turn alike."""
+    """No directed edge twice: at most two triangles an edge, turning alike; no vertex twice in a triangle."""
     again = {edge: n for edge, n in directed_edges(triangles).items() if n > 1}
     assert not again, f"{len(again)} directed edges used more than once"
     assert all(len(set(t)) == 3 for t in triangles.tolist())
@@ -176,7 +176,7 @@ def rectangle(
     per_m2: float,
     sigma: float,
 ) -> F64:
-    """Random points (n, 3) on the parallelogram ``corner + a u + b v`` with Gaussian noise along its normal."""
+    """Random points (n, 3) on the parallelogram ``corner + a u + b v`` with Gaussian noise across it."""
     c, u, v = (np.array(list(x), np.float64) for x in (corner, u, v))
     normal = np.cross(u, v)
     size = float(np.linalg.norm(normal))
@@ -205,7 +205,8 @@ def corridor(
     frames = []
     for index, place in enumerate(places):
         rng = np.random.default_rng(index)
-        p = rng.uniform((-reach_m, -1.05, -0.95), (reach_m, 1.05, 1.15), (points, 3)) + (place[0], 0.0, 0.0)
+        x = place[0]
+        p = rng.uniform((x - reach_m, -1.05, -0.95), (x + reach_m, 1.05, 1.15), (points, 3))
         side = np.arange(points) % 4
         p[side == 0, 1], p[side == 1, 1], p[side == 2, 2], p[side == 3, 2] = -1.05, 1.05, -0.95, 1.15
         p += rng.normal(0.0, 0.005, p.shape)
@@ -216,7 +217,7 @@ def corridor(
 
 @contextmanager
 def closing_page_files() -> Iterator[None]:
-    """Closes, at the end, the files of all pagers made meanwhile: a pipeline does so only when it saves its map."""
+    """Closes the files of all pagers made meanwhile: a pipeline does so only when it saves its map."""
     made: list[PageFile] = []
 
     class Listed(PageFile):

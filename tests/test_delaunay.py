@@ -28,7 +28,7 @@ def _inner(corner: I32, n: int) -> Triangles:
 
 
 def _assert_consistent(corner: I32, link: I32) -> None:
-    """Each link leads over the opposite edge to a triangle that runs through it the other way and links back."""
+    """Each link leads over the opposite edge to a triangle that runs it the other way and links back."""
     for t, (c, across) in enumerate(zip(corner.tolist(), link.tolist(), strict=True)):
         assert len(set(c)) == 3
         for k in range(3):
@@ -64,7 +64,7 @@ def test_random_points_give_qhulls_triangles(n: int) -> None:
         _assert_empty_circles(corner, x, y, n)
         theirs = {tuple(sorted(t)) for t in Delaunay(points).simplices.tolist()}
         ours = _inner(corner, n)
-        # the enclosing triangle is not at infinity: only slivers at the hull may be missing, none may be extra
+        # the enclosing triangle is not at infinity: slivers at the hull may be missing, none may be extra
         assert ours <= theirs
         different += len(theirs - ours)
         total += len(theirs)

@@ -171,7 +171,7 @@ def test_waiting_and_lately_seen_blocks_stay(tmp_path: Path) -> None:
     assert mapper.pager.paged_out > 0
     assert mapper.mesher.waiting == waiting
     resident = mapper.store.block[mapper.pager.resident()]
-    gone = [mapper.pager.file.get(k).block[0, 0] for k in mapper.pager.file.keys()]
+    gone = [mapper.pager.file.get(k).block[0, 0] for k in mapper.pager.file.keys().tolist()]
     assert min(resident[:, 0]) >= 0 and max(gone) * mapper.voxel_map.block_m < 45.0
 
 
