@@ -18,10 +18,10 @@ TRIMS = 2  # rounds of trimming; more find next to nothing (docs/tuning.md)
 _SHIFT = 32
 
 
-def finish(vertices: F32, faces: I32, longest_m: float, smallest_island: int) -> I32:
-    """Triangles (t, 3) of the finished mesh over the same ``vertices`` float32 (n, 3)."""
+def finish(vertices: F32, normals: F32, faces: I32, longest_m: float, smallest_island: int) -> I32:
+    """Triangles (t, 3) of the finished mesh over the same ``vertices`` and ``normals`` float32 (n, 3)."""
     for _ in range(2):
-        faces = close_loops(vertices, faces, longest_m)
+        faces = close_loops(vertices, normals, faces, longest_m)
     for _ in range(TRIMS):
         faces = faces[free_edges(faces).sum(axis=1) < 2]
     return faces[large_islands(faces, len(vertices), smallest_island)]
@@ -43,8 +43,11 @@ def free_edges(faces: I32) -> Bool:
     return ~found.reshape(3, -1).T
 
 
-def close_loops(vertices: F32, faces: I32, longest_m: float) -> I32:
-    """Faces with every hole of at most ``LONGEST_LOOP`` edges filled whose diagonals are below ``longest_m``."""
+def close_loops(vertices: F32, normals: F32, faces: I32, longest_m: float) -> I32:
+    """Faces with every hole of at most ``LONGEST_LOOP`` edges filled whose diagonals are below ``longest_m``.
+
+    A fill must face as its vertices do: the rim of a small island is a loop too, but its inside is the back.
+    """
     keys = _half_edges(faces)
     free = free_edges(faces).T
     # a hole runs against the triangles around it
@@ -55,7 +58,7 @@ def close_loops(vertices: F32, faces: I32, longest_m: float) -> I32:
     fill = np.empty((len(start) + LONGEST_LOOP, 3), np.int32)
     used = np.zeros(len(start), np.uint8)
     loop, edge = np.empty(LONGEST_LOOP, np.int64), np.empty(LONGEST_LOOP, np.int64)
-    n = fill_loops(vertices, start, end, ranked, longest_m, used, loop, edge, fill)
+    n = fill_loops(vertices, normals, start, end, ranked, longest_m, used, loop, edge, fill)
     return np.concatenate((faces, _without_doubles(faces, fill[:n])))
 
 
@@ -123,7 +126,22 @@ def _length2(vertices: F32, a: int, b: int) -> float:
 
 
 @kernel
-def _clip_ears(vertices: F32, ranked: I64, longest_m: float, loop: I64, n: int, fill: I32, count: int) -> int:
+def _faces_out(vertices: F32, normals: F32, a: int, b: int, c: int) -> bool:
+    p, q, r = vertices[a], vertices[b], vertices[c]
+    ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    total = 0.0
+    for i in (a, b, c):
+        g = normals[i]
+        total += nx * g[0] + ny * g[1] + nz * g[2]
+    return total > 0.0
+
+
+@kernel
+def _clip_ears(
+    vertices: F32, normals: F32, ranked: I64, longest_m: float, loop: I64, n: int, fill: I32, count: int
+) -> int:
     """Triangulate a loop by its shortest diagonals; returns the new count, or the old one when it may not be."""
     first = count
     while n > 3:
@@ -136,18 +154,31 @@ def _clip_ears(vertices: F32, ranked: I64, longest_m: float, loop: I64, n: int, 
         if best < 0:
             return first
         a, b, c = loop[best - 1 if best else n - 1], loop[best], loop[(best + 1) % n]
+        if not _faces_out(vertices, normals, a, b, c):
+            return first
         fill[count, 0], fill[count, 1], fill[count, 2] = a, b, c
         count += 1
         n -= 1
         for k in range(best, n):
             loop[k] = loop[k + 1]
+    if not _faces_out(vertices, normals, loop[0], loop[1], loop[2]):
+        return first
     fill[count, 0], fill[count, 1], fill[count, 2] = loop[0], loop[1], loop[2]
     return count + 1
 
 
 @kernel
 def fill_loops(
-    vertices: F32, start: I64, end: I64, ranked: I64, longest_m: float, used: U8, loop: I64, edge: I64, fill: I32
+    vertices: F32,
+    normals: F32,
+    start: I64,
+    end: I64,
+    ranked: I64,
+    longest_m: float,
+    used: U8,
+    loop: I64,
+    edge: I64,
+    fill: I32,
 ) -> int:
     """Walk the free edges (sorted by ``start``) and triangulate short loops; returns triangles in ``fill``.
 
@@ -160,7 +191,7 @@ def fill_loops(
         n = _walk(start, end, used, seed, loop, edge)
         if n == 0:
             continue
-        filled = _clip_ears(vertices, ranked, longest_m, loop, n, fill, count)
+        filled = _clip_ears(vertices, normals, ranked, longest_m, loop, n, fill, count)
         if filled > count:
             count = filled
             for k in range(n):

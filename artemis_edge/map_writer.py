@@ -29,7 +29,7 @@ def gather_mesh(pager: Pager, longest_m: float, smallest_island: int) -> Mesh:
     faces = _join(vertex_id, order, triangle_ids)
     del triangle_ids
     position, normal, sure = _attributes(pager, len(vertex_id))
-    faces = finish(position, faces, longest_m, smallest_island)
+    faces = finish(position, normal, faces, longest_m, smallest_island)
     used = np.zeros(len(vertex_id), bool)
     used[faces] = True
     renumber = np.cumsum(used, dtype=np.int32) - np.int32(1)

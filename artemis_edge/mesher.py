@@ -9,6 +9,7 @@ and all triangles around it turn the same way.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -36,13 +37,14 @@ from artemis_edge.cell_code import CODES, gather_cells, neighbour_shift
 from artemis_edge.config import MesherConfig
 from artemis_edge.delaunay import delaunay
 from artemis_edge.frames import F64, I32, U8
-from artemis_edge.voxel_map import RefreshRules, RefreshSpace, VoxelMap, refresh_space, refresh_voxel
+from artemis_edge.voxel_map import AT_ONCE, RefreshRules, RefreshSpace, VoxelMap, refresh_space, refresh_voxel
 
 # Neighbours' vertices one cell around take part. Two cells halve the edges that neighbours disagree about, but cost
 # 60 % more and score no better, because ears close what is left (docs/tuning.md)
 MARGIN_CELLS = 1
 MOST_VERTICES = 192  # a voxel and its margin; more (dense foliage) are left out, nearest first
 MOST_TRIANGLES = 512
+FLUSHES = 16  # rounds of the flush; the third finds next to nothing
 MOST_GROUPS = 2  # a voxel may hold both sides of a thin wall
 EAR = 1 << 15  # flag in the first code of a triangle that only fills a gap
 
@@ -87,6 +89,7 @@ class Workspace(NamedTuple):
     patch: NDArray[np.uint16]  # (MOST_TRIANGLES, 3) codes
     frame: F64  # (3, 3) rows: first axis, second axis, direction
     direction: F64  # (MOST_GROUPS, 3)
+    out: F64  # (3,)
     tally: NDArray[np.int64]  # (8,) 0 voxels, 1 vertices, 2 accepted, 3 edge taken, 4 too long, 5 normals, 6 ears
 
 
@@ -120,6 +123,7 @@ def workspace() -> Workspace:
         patch=np.empty((MOST_TRIANGLES, 3), np.uint16),
         frame=np.empty((3, 3)),
         direction=np.empty((MOST_GROUPS, 3)),
+        out=np.empty(3),
         tally=np.zeros(8, np.int64),
     )
 
@@ -135,7 +139,7 @@ def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace)
         edges, ears = take_neighbour_edges(store, w)
         groups = 0
         while groups < MOST_GROUPS and _direction(n, w):
-            triangles, edges = _mesh_group(n, voxel_m, rules, w, triangles, edges)
+            triangles, edges = _mesh_group(n, rules, w, triangles, edges)
             for k in range(3):
                 w.direction[groups, k] = w.frame[2, k]
             groups += 1
@@ -246,6 +250,7 @@ def _settle_ears(store: Store, ears: int, w: Workspace, edges: int) -> int:
         )
         if taken:
             store.voxel[u, PATCH_LEN] -= 1
+            store.block[store.voxel[u, BLOCK], CHANGED] = max(store.block[store.voxel[u, BLOCK], CHANGED], 1)
             at = store.voxel[u, PATCH_AT]
             last = at + store.voxel[u, PATCH_LEN]
             for k in range(3):
@@ -335,7 +340,7 @@ def _select(n: int, group_cosine: float, w: Workspace) -> int:
 
 
 @kernel
-def _mesh_group(n: int, voxel_m: float, rules: Rules, w: Workspace, triangles: int, edges: int) -> tuple[int, int]:
+def _mesh_group(n: int, rules: Rules, w: Workspace, triangles: int, edges: int) -> tuple[int, int]:
     """Delaunay of one group; accepted own triangles are appended. Returns (triangles, edges)."""
     m = _select(n, rules.group_cosine, w)
     if m >= 3:
@@ -345,7 +350,7 @@ def _mesh_group(n: int, voxel_m: float, rules: Rules, w: Workspace, triangles: i
             if i >= m or j >= m or k >= m:
                 continue
             a, b, c = w.order[i], w.order[j], w.order[k]
-            if not _is_owned(a, b, c, voxel_m, w.position) or not is_surface(a, b, c, rules, w):
+            if not _is_owned(a, b, c, w.local_code) or not is_surface(a, b, c, rules, w):
                 continue
             if w.edge[a, b] or w.edge[b, c] or w.edge[c, a]:
                 w.tally[3] += 1
@@ -368,10 +373,14 @@ def _accept(a: int, b: int, c: int, w: Workspace, triangles: int, edges: int) ->
 
 
 @kernel
-def _is_owned(a: int, b: int, c: int, voxel_m: float, position: F64) -> bool:
-    for k in range(3):
-        middle = (position[a, k] + position[b, k] + position[c, k]) / 3.0
-        if middle < 0.0 or middle >= voxel_m:
+def _is_owned(a: int, b: int, c: int, code: I32) -> bool:
+    """Whether the middle of the three cells lies in the own voxel: by cells, which never move, not by positions.
+
+    Own coordinates are 12..15, so three cell centres have their mean in the voxel when they sum to 35..46.
+    """
+    for shift in (10, 5, 0):
+        total = ((code[a] >> shift) & 31) + ((code[b] >> shift) & 31) + ((code[c] >> shift) & 31)
+        if total < 35 or total > 46:
             return False
     return True
 
@@ -435,13 +444,15 @@ def _fill_ears(n: int, d: F64, rules: Rules, w: Workspace, triangles: int, edges
             j = w.hole[j, 2]
             if x == b or w.edge[a, x] or w.edge[x, b] or not (w.own[a] or w.own[b] or w.own[x]):
                 continue
+            if not _faces_out(b, a, x, w) or triangles == MOST_TRIANGLES:
+                continue
+            if _edge2(w.position, b, x) > rules.long_edge_m * rules.long_edge_m:
+                continue
             if _is_loop(w, b, x) or (
                 _turn(b, a, x, d, w.position) > 0.0
                 and is_surface(b, a, x, rules, w)
                 and _is_empty(b, a, x, n, d, w.position)
             ):
-                if _edge2(w.position, b, x) > rules.long_edge_m * rules.long_edge_m:
-                    continue
                 triangles, edges = _accept(b, a, x, w, triangles, edges)
                 w.tally[6] += 1
                 if w.edge[b, x] == 0:
@@ -469,6 +480,14 @@ def _add_hole(w: Workspace, start: int, end: int, holes: int) -> int:
     w.hole[holes, 0], w.hole[holes, 1], w.hole[holes, 2] = start, end, w.hole_of[start]
     w.hole_of[start] = holes
     return holes + 1
+
+
+@kernel
+def _faces_out(a: int, b: int, c: int, w: Workspace) -> bool:
+    """Whether a triangle faces the way its vertices do; the rim of a lone triangle is no hole to be closed."""
+    for k in range(3):
+        w.out[k] = w.normal[a, k] + w.normal[b, k] + w.normal[c, k]
+    return _turn(a, b, c, w.out, w.position) > 0.0
 
 
 @kernel
@@ -508,7 +527,7 @@ class Schedule(NamedTuple):
 def is_due(store: Store, v: int, waited: int, schedule: Schedule) -> bool:
     """Whether enough is new: a first patch after ``wait``, then new vertices or evidence grown ``growth`` fold."""
     row = store.voxel[v]
-    if waited < schedule.wait and row[FRESH] < 64:
+    if waited < schedule.wait and row[FRESH] < AT_ONCE:
         return False
     if row[AT_MESH] == 0:
         return row[PENDING] > 0
@@ -577,6 +596,8 @@ def mesh_batch(
         row[FRESH] = 0  # what the batch's other voxels told it while they were refreshed is in its patch now
         if not mesh_voxel(store, v, voxel_m, rules, w):
             refused += 1
+            row[FRESH] = AT_ONCE
+            bs.enqueue(store, v, stamp)
         store.block[store.voxel[v, BLOCK], CHANGED] = stamp
     return refused
 
@@ -584,8 +605,12 @@ def mesh_batch(
 class Mesher:
     """Keeps the patches of a ``VoxelMap`` up to date, a bounded number a frame."""
 
-    def __init__(self, config: MesherConfig, voxel_map: VoxelMap) -> None:
+    def __init__(
+        self, config: MesherConfig, voxel_map: VoxelMap, make_ready: Callable[[I32, int], None] | None = None
+    ) -> None:
+        """``make_ready`` (blocks, stamp) is called before patches change: their neighbours must be in memory."""
         self._map = voxel_map
+        self._make_ready = make_ready or (lambda blocks, stamp: None)
         cell = voxel_map.cell_m
         self._refresh_rules = RefreshRules(
             cell_m=cell,
@@ -615,9 +640,12 @@ class Mesher:
 
     def flush(self, stamp: int) -> None:
         """Mesh everything that was postponed. Meshing can promote neighbours, hence until nothing is left."""
-        while self.waiting:
+        for _ in range(FLUSHES):
             batch = np.empty(self.waiting, np.int32)
-            self._mesh(batch[: choose_batch(self._map.store, stamp, self._schedule, True, batch)], stamp)
+            n = choose_batch(self._map.store, stamp, self._schedule, True, batch)
+            if n == 0:
+                return
+            self._mesh(batch[:n], stamp)
 
     @property
     def waiting(self) -> int:
@@ -625,6 +653,7 @@ class Mesher:
         return int(self._map.store.counter[QUEUE_LEN])
 
     def _mesh(self, batch: I32, stamp: int) -> None:
+        self._make_ready(np.unique(self._map.store.voxel[batch, BLOCK]), stamp)
         # block by block: voxels of a block share cells and neighbours, which are then in the cache
         batch = batch[np.argsort(self._map.store.voxel[batch, BLOCK], kind="stable")]
         self.refused += mesh_batch(

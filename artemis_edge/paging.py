@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 
 from artemis_edge import block_store as bs
-from artemis_edge._jit import kernel
+from artemis_edge._jit import kernel, njit
 from artemis_edge.block_store import (
     ALIVE,
     AT_MESH,
@@ -23,6 +23,7 @@ from artemis_edge.block_store import (
     FRESH,
     PATCH_AT,
     PATCH_LEN,
+    PATCH_ROOM,
     PENDING,
     QUEUED,
     SEEN,
@@ -227,8 +228,10 @@ def restore_block(
                 for q in range(8):
                     store.vertex[s, q] = vertex[j, q]
             j += 1
-        if store.voxel[v, PATCH_LEN] == 0:
-            bs.set_patch(store, v, triangle[k : k + n_triangles[i]], n_triangles[i])
+        if store.voxel[v, PATCH_LEN] == 0 and not bs.set_patch(
+            store, v, triangle[k : k + n_triangles[i]], n_triangles[i]
+        ):
+            return False
         k += n_triangles[i]
     store.block[block, SEEN] = stamp
     return True
@@ -242,6 +245,37 @@ def has_waiting(store: Store, block: int) -> bool:
         if v >= 0 and store.voxel[v, QUEUED] != 0:
             return True
     return False
+
+
+@njit
+def voxels_with_room(store: Store) -> I32:
+    """Slots of resident voxels that own room for triangles."""
+    out = np.empty(store.voxel.shape[0], np.int32)
+    n = 0
+    for at in range(store.hash_key.shape[0]):
+        if store.hash_key[at] == bs.EMPTY_KEY:
+            continue
+        for inner in range(512):
+            v = store.block_voxel[store.hash_slot[at], inner]
+            if v >= 0 and store.voxel[v, PATCH_ROOM] > 0:
+                out[n] = v
+                n += 1
+    return out[:n].copy()
+
+
+@kernel
+def compact_patches(store: Store, voxels: I32) -> None:
+    """Close the gaps between the patches of ``voxels``, which come in the order of their places."""
+    end = 0
+    for v in voxels:
+        at = store.voxel[v, PATCH_AT]
+        for t in range(store.voxel[v, PATCH_LEN]):
+            for k in range(3):
+                store.triangle[end + t, k] = store.triangle[at + t, k]
+        store.voxel[v, PATCH_AT] = end
+        end += store.voxel[v, PATCH_ROOM]
+    store.counter[bs.N_TRIANGLES] = end
+    store.free_patches[:] = 0
 
 
 @kernel
@@ -297,6 +331,8 @@ def page_from_bytes(data: bytes) -> Page:
             raise ValueError("page cut off")
         arrays.append(np.frombuffer(data, kind, count, at).reshape(shape))
         at += count * np.dtype(kind).itemsize
+    if at != len(data) or arrays[2].sum() != c or arrays[3].sum() != t:
+        raise ValueError("page does not add up")
     return Page(np.array([[bx, by, bz]], np.int32), np.array([v], np.int32), *arrays)
 
 
@@ -389,6 +425,8 @@ class Pager:
 
     def make_room(self, stamp: int, busy_frames: int = 50) -> None:
         """Send blocks to disk when a pool is 85 % full, until it is 70 % full; never one seen lately."""
+        if self._store.counter[bs.N_TRIANGLES] > 0.85 * len(self._store.triangle):
+            self._compact()
         if self.fill() < 0.85:
             return
         slots = self.resident()
@@ -396,11 +434,17 @@ class Pager:
         for slot in slots[np.argsort(seen, kind="stable")]:
             if self._store.block[slot, SEEN] > stamp - busy_frames or self.fill() < 0.70:
                 return
-            if not has_waiting(self._store, slot):
+            if not has_waiting(self._store, slot) and self._store.block[slot, CHANGED] == 0:
                 one = np.array([slot], np.int32)
                 self.file.put(int(slot_keys(self._store, one)[0]), pack(self._store, one))
                 bs.remove_block(self._store, slot)
                 self.paged_out += 1
+
+    def _compact(self) -> None:
+        """Move all patches together: rooms of the wrong size would else be free and of no use."""
+        voxels = voxels_with_room(self._store)
+        order = np.argsort(self._store.voxel[voxels, PATCH_AT], kind="stable")
+        compact_patches(self._store, voxels[order])
 
     def fill(self) -> float:
         """Share of the fullest pool that is in use."""

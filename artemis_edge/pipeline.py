@@ -30,9 +30,9 @@ class Pipeline:
         self.config = config
         self.odometry = odometry
         self.voxel_map = VoxelMap(config.voxel_map, (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6)
-        self.mesher = Mesher(config.mesher, self.voxel_map)
         self.free_space = FreeSpace(config.voxel_map, self.voxel_map)
         self.pager = Pager(self.voxel_map.store, page_folder)
+        self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.bring_back)
         self.outbox = Outbox(self.voxel_map.store)
         self.trajectory: list[tuple[int, F64]] = []
         self.stage_ms: dict[str, float] = {}

@@ -31,7 +31,7 @@ from artemis_edge.block_store import (
 )
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.frames import F32, F64, DeskewedScan, TrackedFrame
-from artemis_edge.voxel_map import VoxelMap, is_seen_through
+from artemis_edge.voxel_map import AT_ONCE, VoxelMap, is_seen_through
 
 PIXELS = 256  # a face; 0.45 degrees a pixel in its middle, the line spacing of common LiDARs
 FAR = np.float32(1.0e6)
@@ -206,5 +206,5 @@ def _remesh_around(store: Store, v: int, stamp: int) -> None:
                 if block >= 0:
                     u = store.block_voxel[block, bs.inner_index(x + dx, y + dy, z + dz)]
                     if u >= 0:
-                        store.voxel[u, FRESH] += 64  # at once, however many vertices it has
+                        store.voxel[u, FRESH] += AT_ONCE
                         bs.enqueue(store, u, stamp)

@@ -47,6 +47,13 @@ from artemis_edge.frames import F32, F64, I32, U8, TrackedFrame
 POOL_FULL = -1
 # A cell with this much evidence no longer asks for re-meshing: its mean moves by less than sigma / 8
 SETTLED_COUNT = 64.0
+# Fewer hits lie on some plane by chance: three always do
+TRUSTED_COUNT = 6.0
+# A living vertex gives way below this share of the distance that a new one must keep: what a few hits put apart,
+# the mean of many can bring together
+STAYS = 0.7
+# FRESH of a voxel whose patch must be made anew whatever else it waits for: a vertex it uses is gone
+AT_ONCE = 64
 # Moments stop growing here, far below where float32 sums lose digits
 SATURATED_COUNT = 1000.0
 
@@ -202,6 +209,7 @@ class RefreshSpace(NamedTuple):
     moment: F64  # (216, 16) about the voxel's corner
     total: F64  # (16,)
     eigen: F64  # (6,)
+    wide: F64  # (8,) plane of all 6 x 6 x 6 cells: point, normal, smallest and middle eigenvalue
 
 
 def refresh_space() -> RefreshSpace:
@@ -214,6 +222,7 @@ def refresh_space() -> RefreshSpace:
         moment=np.zeros((216, 16)),
         total=np.empty(16),
         eigen=np.empty(6),
+        wide=np.empty(8),
     )
 
 
@@ -231,6 +240,7 @@ def refresh_voxel(store: Store, v: int, stamp: int, rules: RefreshRules, w: Refr
         w.slot[i] = w.grid[w.code[i]]
         w.grid[w.code[i]] = i
         _move_moments(store.evidence, w.slot[i], w.code[i], rules.cell_m, w.moment, i)
+    _fit_wide(w.moment, n, w.total, w.eigen, w.wide)
     x0, y0, z0 = (
         store.voxel[v, IX] * 4 * rules.cell_m,
         store.voxel[v, IY] * 4 * rules.cell_m,
@@ -247,17 +257,20 @@ def refresh_voxel(store: Store, v: int, stamp: int, rules: RefreshRules, w: Refr
             state[s] = EVIDENCE_ONLY
         _sum_around(w.grid, w.code[i], w.moment, w.total)
         p = store.vertex[s]
-        _fit_vertex(w.moment[i], w.total, rules.plane_sigma_m, w.eigen, p)
+        _fit_vertex(w.moment[i], w.total, w.wide, rules.plane_sigma_m, w.eigen, p)
         p[POSITION] += x0
         p[POSITION + 1] += y0
         p[POSITION + 2] += z0
-        if (
+        if state[s] == ALIVE and _is_crowded(store, w.grid, w.slot, w.code[i], s, STAYS * rules.min_distance_m):
+            state[s] = EVIDENCE_ONLY
+            _tell_neighbours(store, w.neighbour, X, Y, Z, AT_ONCE, stamp)
+        elif (
             state[s] == EVIDENCE_ONLY
             and w.total[0] >= rules.least_evidence
             and _is_apart(store.vertex, state, w.grid, w.slot, w.code[i], s, rules.min_distance_m)
         ):
             state[s] = ALIVE
-            _tell_neighbours(store, w.neighbour, X, Y, Z, stamp)
+            _tell_neighbours(store, w.neighbour, X, Y, Z, 1, stamp)
     for i in range(n):
         w.grid[w.code[i]] = -1
 
@@ -297,15 +310,8 @@ def _sum_around(grid: I32, at: int, moment: F64, total: F64) -> None:
 
 
 @kernel
-def _fit_vertex(own: F64, total: F64, plane_sigma_m: float, eigen: F64, p: F32) -> None:
-    """Position, normal and roughness of one vertex, about the voxel's corner (E_geometry of eq. 2).
-
-    The vertex goes onto the common plane; where the cells do not agree on a plane (smallest eigenvalue above
-    sigma^2: a crease, a bush) only by the share sigma^2 / lambda_0, because there a plane would cut the corner
-    (measured: ungated vertices are worse than raw ones at creases).
-    """
-    k = 1.0 / own[0]
-    mx, my, mz = own[1] * k, own[2] * k, own[3] * k
+def _plane(total: F64, eigen: F64) -> tuple[float, float, float]:
+    """Mean of accumulated moments; ``eigen`` receives the normal and the eigenvalues of their covariance."""
     k = 1.0 / total[0]
     gx, gy, gz = total[1] * k, total[2] * k, total[3] * k
     smallest_eigen3(
@@ -317,15 +323,55 @@ def _fit_vertex(own: F64, total: F64, plane_sigma_m: float, eigen: F64, p: F32) 
         total[9] * k - gz * gz,
         eigen,
     )
+    return gx, gy, gz
+
+
+@kernel
+def _fit_wide(moment: F64, n: int, total: F64, eigen: F64, wide: F64) -> None:
+    """Plane of the whole 6 x 6 x 6 cells into ``wide``."""
+    for q in range(16):
+        total[q] = 0.0
+    for i in range(n):
+        for q in range(16):
+            total[q] += moment[i, q]
+    if total[0] == 0.0:
+        return
+    wide[0], wide[1], wide[2] = _plane(total, eigen)
+    wide[3], wide[4], wide[5] = eigen[0], eigen[1], eigen[2]
+    wide[6], wide[7] = max(eigen[3], 0.0), max(eigen[4], 0.0)
+
+
+@kernel
+def _fit_vertex(own: F64, total: F64, wide: F64, plane_sigma_m: float, eigen: F64, p: F32) -> None:
+    """Position, normal and roughness of one vertex, about the voxel's corner (E_geometry of eq. 2).
+
+    Two supports are tried. Where the near cells (3) agree on a plane within sigma, the vertex goes onto it. Where
+    they are too few or too noisy, but the wide support (1.5 voxels) is hardly thicker, the surface is a plane as
+    far as the noise lets one see, and the vertex goes onto the wide plane, which averages over more points. Else
+    (a crease, a bush) it goes onto the near plane only by the share sigma^2 / lambda_0, because there a plane
+    would cut the corner (measured: ungated vertices are worse than raw ones at creases).
+    """
+    sigma2 = plane_sigma_m * plane_sigma_m
+    k = 1.0 / own[0]
+    mx, my, mz = own[1] * k, own[2] * k, own[3] * k
+    gx, gy, gz = _plane(total, eigen)
     nx, ny, nz = eigen[0], eigen[1], eigen[2]
+    l0, l1 = max(eigen[3], 0.0), max(eigen[4], 0.0)
+    # a plane: the points spread at least twice as far along it as across it
+    flat = l1 > 4.0 * l0 and l1 > 1e-8
+    share = 0.0
+    if flat and l0 <= sigma2 and total[0] >= TRUSTED_COUNT:
+        share = 1.0
+    elif wide[7] > 4.0 * wide[6] and wide[6] <= max(1.5 * l0, 2.25 * sigma2):
+        gx, gy, gz = wide[0], wide[1], wide[2]
+        nx, ny, nz = wide[3], wide[4], wide[5]
+        share = 1.0
+    elif flat:
+        share = min(1.0, sigma2 / max(l0, 1e-12))
     vx, vy, vz = total[10], total[11], total[12]
     if nx * vx + ny * vy + nz * vz < 0.0:
         nx, ny, nz = -nx, -ny, -nz
-    l0, l1 = max(eigen[3], 0.0), max(eigen[4], 0.0)
-    if l1 > 4.0 * l0 and l1 > 1e-8:
-        # a plane: the points spread at least twice as far along it as across it
-        sigma2 = plane_sigma_m * plane_sigma_m
-        share = 1.0 if l0 <= sigma2 else sigma2 / l0
+    if share > 0.0:
         d = share * ((mx - gx) * nx + (my - gy) * ny + (mz - gz) * nz)
         mx, my, mz = mx - d * nx, my - d * ny, mz - d * nz
     else:
@@ -338,7 +384,7 @@ def _fit_vertex(own: F64, total: F64, plane_sigma_m: float, eigen: F64, p: F32) 
 
 
 @kernel
-def _tell_neighbours(store: Store, neighbour: I32, X: int, Y: int, Z: int, stamp: int) -> None:
+def _tell_neighbours(store: Store, neighbour: I32, X: int, Y: int, Z: int, news: int, stamp: int) -> None:
     """A vertex began or ceased to live in cell X, Y, Z (0..3): voxels that have it in their margin must know."""
     for k in range(27):
         u = neighbour[k]
@@ -351,7 +397,7 @@ def _tell_neighbours(store: Store, neighbour: I32, X: int, Y: int, Z: int, stamp
             and (dz == 0 or (dz < 0 and Z == 0) or (dz > 0 and Z == 3))
         )
         if near and store.voxel[u, bs.AT_MESH] > 0:
-            store.voxel[u, FRESH] += 1
+            store.voxel[u, FRESH] += news
             bs.enqueue(store, u, stamp)
 
 
@@ -359,6 +405,25 @@ def _tell_neighbours(store: Store, neighbour: I32, X: int, Y: int, Z: int, stamp
 def is_seen_through(e: F32) -> bool:
     """Whether the looks through a cell outweigh those that ended in it (visibility.py)."""
     return e[THROUGH] >= 2.0 and e[THROUGH] >= 0.3 * (e[THROUGH] + e[CONFIRMED] + 1.0)
+
+
+@kernel
+def _is_crowded(store: Store, grid: I32, slot: I32, at: int, s: int, distance: float) -> bool:
+    """Whether a living vertex with more evidence is nearer than ``distance``."""
+    p, mine = store.vertex[s], store.evidence[s, COUNT]
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                i = grid[at + (dx << 10) + (dy << 5) + dz]
+                if i < 0 or slot[i] == s or store.state[slot[i]] != ALIVE:
+                    continue
+                theirs = store.evidence[slot[i], COUNT]
+                if theirs < mine or (theirs == mine and slot[i] > s):
+                    continue
+                q = store.vertex[slot[i]]
+                if (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2 < distance * distance:
+                    return True
+    return False
 
 
 @kernel
