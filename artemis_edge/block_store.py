@@ -108,15 +108,14 @@ def allocate(budget_bytes: float) -> Store:
 @kernel
 def block_key(bx: int, by: int, bz: int) -> int:
     """Key of a block: 21 bits an axis, enough for 3,000 km of 3.2 m blocks."""
-    return (
-        ((np.int64(bx) + 1048576) << 42) | ((np.int64(by) + 1048576) << 21) | (np.int64(bz) + 1048576)
-    )
+    return ((int(bx) + 1048576) << 42) | ((int(by) + 1048576) << 21) | (int(bz) + 1048576)
 
 
 @kernel
 def home_slot(key: int, mask: int) -> int:
     """Where a key would like to be; Fibonacci hashing spreads keys that differ in few bits."""
-    return np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask
+    spread = (np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)
+    return int(np.int64(spread) & mask)
 
 
 @kernel
@@ -308,7 +307,9 @@ def remove_block(store: Store, block: int) -> None:
         store.free_voxel[store.counter[FREE_VOXELS]] = v
         store.counter[FREE_VOXELS] += 1
     row = store.block[block]
-    _remove_key(store.hash_key, store.hash_slot, find_slot(store.hash_key, block_key(row[BX], row[BY], row[BZ])))
+    _remove_key(
+        store.hash_key, store.hash_slot, find_slot(store.hash_key, block_key(row[BX], row[BY], row[BZ]))
+    )
     store.block[block, SEEN] = -1
     store.free_block[store.counter[FREE_BLOCKS]] = block
     store.counter[FREE_BLOCKS] += 1

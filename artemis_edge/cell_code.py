@@ -65,7 +65,7 @@ def gather_voxel(store: Store, w: int, k: int, margin: int, grid: I32, code: I32
             mask >>= np.uint64(1)
             c += 1
         X, Y, Z = bx + (c >> 4), by + ((c >> 2) & 3), bz + (c & 3)
-        if lo <= X and X < hi and lo <= Y and Y < hi and lo <= Z and Z < hi:
+        if lo <= X and hi > X and lo <= Y and hi > Y and lo <= Z and hi > Z:
             at = code_of(X, Y, Z)
             grid[at] = store.voxel_cell[w, c]
             code[n] = at

@@ -21,7 +21,8 @@ from artemis_edge.errors import InputError
 
 
 def _float(text: str, *, ge: float | None = None, gt: float | None = None, le: float | None = None) -> Meta:
-    return Meta(description=text, ge=ge, gt=gt, le=le)
+    bounds = {"ge": ge, "gt": gt, "le": le}
+    return Meta(description=text, **{k: v for k, v in bounds.items() if v is not None})  # type: ignore[call-overload,no-any-return]
 
 
 class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -96,7 +97,8 @@ class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
         float, _float("How far around the sensor vertices are judged by free space [m].", gt=0.0, le=200.0)
     ] = 30.0
     free_space_slope: Annotated[
-        float, _float("Share of the range by which a look must miss a vertex, besides a voxel.", ge=0.0, le=0.2)
+        float,
+        _float("Share of the range by which a look must miss a vertex, besides a voxel.", ge=0.0, le=0.2),
     ] = 0.02
     memory_budget_mb: Annotated[
         int,
@@ -126,14 +128,18 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1.5
     coplanar: Annotated[
         float,
-        _float("Or the cosine between a triangle's normal and its vertices' normals that does.", ge=0.0, le=1.1),
+        _float(
+            "Or the cosine between a triangle's normal and its vertices' normals that does.", ge=0.0, le=1.1
+        ),
     ] = 0.9
     agreement: Annotated[
         float, _float("Least such cosine of any triangle; -1 accepts all.", ge=-1.0, le=1.0)
     ] = -1.0
     group_cosine: Annotated[
         float,
-        _float("Vertices whose normal is this near to a voxel's direction are meshed together.", ge=-1.0, le=1.0),
+        _float(
+            "Vertices whose normal is this near to a voxel's direction are meshed together.", ge=-1.0, le=1.0
+        ),
     ] = 0.3
     wait_frames: Annotated[
         int, Meta(description="Frames a voxel collects evidence before its first patch.", ge=0, le=100)
@@ -141,9 +147,7 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     longest_wait_frames: Annotated[
         int, Meta(description="Frames after which a waiting voxel is meshed or let go.", ge=1, le=1000)
     ] = 20
-    fresh: Annotated[
-        int, Meta(description="A patch is made anew when this many vertices are new.", ge=1)
-    ] = 4
+    fresh: Annotated[int, Meta(description="A patch is made anew when this many vertices are new.", ge=1)] = 4
     growth: Annotated[
         float, _float("A patch is made anew when its evidence grew by this factor (3: noise halves).", gt=0.0)
     ] = 3.0

@@ -58,11 +58,13 @@ def count_delta(store: Store, slots: I32, vertex_start: I64, triangle_start: I64
 @kernel
 def vertex_id(x: int, y: int, z: int) -> int:
     """Name of the vertex in cell (x, y, z) of the world: 21 bits each, as ``paging.Page.vertex_ids``."""
-    return ((np.int64(x) + 1048576) << 42) | ((np.int64(y) + 1048576) << 21) | (np.int64(z) + 1048576)
+    return ((int(x) + 1048576) << 42) | ((int(y) + 1048576) << 21) | (int(z) + 1048576)
 
 
 @kernel
-def fill_delta(store: Store, slots: I32, ids: I64, position: F32, normal: F32, sure: F32, triangles: I64) -> None:
+def fill_delta(
+    store: Store, slots: I32, ids: I64, position: F32, normal: F32, sure: F32, triangles: I64
+) -> None:
     """Copy living vertices and triangles of blocks, in the order of ``slots``."""
     i = j = 0
     for slot in slots:
@@ -149,7 +151,5 @@ def to_delta(index: int, store: Store, slots: I32) -> MeshDelta:
         confidence=np.empty(n, np.float32),
         triangles=np.empty((int(triangle_start[-1]), 3), np.int64),
     )
-    fill_delta(
-        store, slots, delta.vertex_id, delta.position, delta.normal, delta.confidence, delta.triangles
-    )
+    fill_delta(store, slots, delta.vertex_id, delta.position, delta.normal, delta.confidence, delta.triangles)
     return delta

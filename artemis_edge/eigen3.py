@@ -9,9 +9,7 @@ from artemis_edge.frames import F64
 
 
 @kernel
-def smallest_eigen3(
-    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, out: F64
-) -> None:
+def smallest_eigen3(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, out: F64) -> None:
     """``out[0:3]`` unit eigenvector of the smallest eigenvalue, ``out[3:6]`` eigenvalues ascending.
 
     Trigonometric solution of the characteristic cubic (O. K. Smith, 1961); the vector is the largest cross

@@ -13,8 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from artemis_edge._jit import kernel
 from artemis_edge.frames import F32, I32, I64, U8, Bool
 
-LONGEST_LOOP = 8  # edges of a hole that is closed: about as wide as the longest edge that is surface
-TRIMS = 2  # rounds of trimming; more find next to nothing (docs/tuning.md)
+LONGEST_LOOP = 12  # edges of a hole that is closed: about as wide as the longest edge that is surface
+TRIMS = 6  # rounds of trimming; more find next to nothing (docs/tuning.md)
 _SHIFT = 32
 
 

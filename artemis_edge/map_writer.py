@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+
 from artemis_edge.block_store import NORMAL, POSITION
 from artemis_edge.config import Config, to_toml
 from artemis_edge.delta import GREY, confidence

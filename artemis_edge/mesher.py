@@ -90,7 +90,9 @@ class Workspace(NamedTuple):
     frame: F64  # (3, 3) rows: first axis, second axis, direction
     direction: F64  # (MOST_GROUPS, 3)
     out: F64  # (3,)
-    tally: NDArray[np.int64]  # (8,) 0 voxels, 1 vertices, 2 accepted, 3 edge taken, 4 too long, 5 normals, 6 ears
+    tally: NDArray[
+        np.int64
+    ]  # (8,) 0 voxels, 1 vertices, 2 accepted, 3 edge taken, 4 too long, 5 normals, 6 ears
 
 
 def workspace() -> Workspace:
@@ -387,7 +389,11 @@ def _is_owned(a: int, b: int, c: int, code: I32) -> bool:
 
 @kernel
 def _edge2(position: F64, a: int, b: int) -> float:
-    dx, dy, dz = position[a, 0] - position[b, 0], position[a, 1] - position[b, 1], position[a, 2] - position[b, 2]
+    dx, dy, dz = (
+        position[a, 0] - position[b, 0],
+        position[a, 1] - position[b, 1],
+        position[a, 2] - position[b, 2],
+    )
     return dx * dx + dy * dy + dz * dz
 
 
@@ -627,7 +633,9 @@ class Mesher:
             agreement=config.agreement,
             group_cosine=config.group_cosine,
         )
-        self._schedule = Schedule(config.wait_frames, config.longest_wait_frames, config.fresh, config.growth, config.most_voxels)
+        self._schedule = Schedule(
+            config.wait_frames, config.longest_wait_frames, config.fresh, config.growth, config.most_voxels
+        )
         self._workspace = workspace()
         self._batch = np.empty(config.most_voxels, np.int32)
         self.refused = 0

@@ -67,7 +67,9 @@ class Page:
         """Name of every cell's vertex, int64 (c,): its cell coordinates, 21 bits each."""
         voxel = np.repeat(self.voxel_index(), self.n_cells, axis=0)
         cell = self.cell.astype(np.int64)
-        return _pack_ids(voxel[:, 0] * 4 + (cell >> 4), voxel[:, 1] * 4 + ((cell >> 2) & 3), voxel[:, 2] * 4 + (cell & 3))
+        return _pack_ids(
+            voxel[:, 0] * 4 + (cell >> 4), voxel[:, 1] * 4 + ((cell >> 2) & 3), voxel[:, 2] * 4 + (cell & 3)
+        )
 
     def triangle_ids(self) -> I64:
         """Vertex names of every triangle, int64 (t, 3)."""
@@ -129,7 +131,11 @@ def fill_page(
             if v < 0:
                 continue
             inner[i] = place
-            meta[i, 0], meta[i, 1], meta[i, 2] = store.voxel[v, PENDING], store.voxel[v, FRESH], store.voxel[v, AT_MESH]
+            meta[i, 0], meta[i, 1], meta[i, 2] = (
+                store.voxel[v, PENDING],
+                store.voxel[v, FRESH],
+                store.voxel[v, AT_MESH],
+            )
             n_triangles[i] = store.voxel[v, PATCH_LEN]
             for t in range(store.voxel[v, PATCH_LEN]):
                 for q in range(3):
@@ -209,7 +215,9 @@ def restore_block(
         place = np.int64(inner[i])
         v = store.block_voxel[block, place]
         if v < 0:
-            v = bs.add_voxel(store, block, place, x0 + (place >> 6), y0 + ((place >> 3) & 7), z0 + (place & 7))
+            v = bs.add_voxel(
+                store, block, place, x0 + (place >> 6), y0 + ((place >> 3) & 7), z0 + (place & 7)
+            )
             if v < 0:
                 return False
         store.voxel[v, PENDING] += meta[i, 0]
@@ -291,7 +299,9 @@ def resident_blocks(store: Store, out: I32) -> int:
 
 def page_bytes(page: Page) -> bytes:
     """A page of one block as bytes."""
-    head = _HEADER.pack(_MAGIC, len(page.inner), *page.block[0].tolist(), len(page.cell), len(page.triangle), 0)
+    head = _HEADER.pack(
+        _MAGIC, len(page.inner), *page.block[0].tolist(), len(page.cell), len(page.triangle), 0
+    )
     parts = (
         page.inner,
         page.meta,
@@ -488,6 +498,8 @@ class Pager:
             page.triangle,
         )
         if not fits:
-            raise MemoryError("the memory budget is too small for what is in view; raise voxel_map.memory_budget_mb")
+            raise MemoryError(
+                "the memory budget is too small for what is in view; raise voxel_map.memory_budget_mb"
+            )
         self._store.block[slot, CHANGED] = stamp
         self.paged_in += 1

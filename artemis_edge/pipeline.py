@@ -7,12 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-
 from artemis_edge.block_store import REFUSED_POINTS
 from artemis_edge.config import Config
-from artemis_edge.delta import MeshDelta, Outbox
+from artemis_edge.delta import Outbox
 from artemis_edge.export.mesh import Mesh
-from artemis_edge.frames import F64, Odometry, SyncedFrame
+from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame
 from artemis_edge.map_writer import save_map, write_mesh
 from artemis_edge.mesher import Mesher
 from artemis_edge.paging import Pager

@@ -124,10 +124,11 @@ def carve(
     slope: float,
     stamp: int,
 ) -> int:
-    """Judge the cells of the blocks around the sensor; every second block a frame. Returns how many lost their evidence.
+    """Judge the cells of the blocks around the sensor, every second block at a time.
 
-    A cell whose points lie at range r was looked through when the range seen there exceeds r + margin + slope r; the margin is
-    a voxel, the slope the error of a range image's pixel at grazing surfaces.
+    A cell whose points lie at range r was looked through when the range seen there exceeds r + margin + slope r;
+    the margin is a voxel, the slope the error of a range image's pixel at grazing surfaces. Returns how many
+    cells lost their evidence.
     """
     R, t = T_world_lidar[:3, :3], T_world_lidar[:3, 3]
     ox = R[0, 0] * origin[0] + R[0, 1] * origin[1] + R[0, 2] * origin[2] + t[0]
@@ -143,7 +144,17 @@ def carve(
                 at = bs.find_slot(store.hash_key, key)
                 if store.hash_key[at] == key:
                     gone += _carve_block(
-                        store, store.hash_slot[at], cube, R, ox, oy, oz, block_m / 32.0, margin_m, slope, stamp
+                        store,
+                        store.hash_slot[at],
+                        cube,
+                        R,
+                        ox,
+                        oy,
+                        oz,
+                        block_m / 32.0,
+                        margin_m,
+                        slope,
+                        stamp,
                     )
     store.counter[CARVED_CELLS] += gone
     return gone
@@ -151,7 +162,17 @@ def carve(
 
 @kernel
 def _carve_block(
-    store: Store, block: int, cube: F32, R: F64, ox: float, oy: float, oz: float, cell_m: float, margin_m: float, slope: float, stamp: int
+    store: Store,
+    block: int,
+    cube: F32,
+    R: F64,
+    ox: float,
+    oy: float,
+    oz: float,
+    cell_m: float,
+    margin_m: float,
+    slope: float,
+    stamp: int,
 ) -> int:
     gone = 0
     for inner in range(512):
@@ -166,7 +187,8 @@ def _carve_block(
             e = store.evidence[s]
             # the mean of the cell's points: a vertex may not have been made of them yet
             k = 1.0 / e[COUNT]
-            dx = (4 * store.voxel[v, IX] + (c >> 4) + 0.5) * cell_m + k * e[SUM] - ox
+            x, y, z = (c >> 4) + 0.5, ((c >> 2) & 3) + 0.5, (c & 3) + 0.5
+            dx = (4 * store.voxel[v, IX] + x) * cell_m + k * e[SUM] - ox
             dy = (4 * store.voxel[v, IY] + ((c >> 2) & 3) + 0.5) * cell_m + k * e[SUM + 1] - oy
             dz = (4 * store.voxel[v, IZ] + (c & 3) + 0.5) * cell_m + k * e[SUM + 2] - oz
             face, row, column = pixel(

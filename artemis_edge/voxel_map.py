@@ -16,7 +16,6 @@ from artemis_edge import block_store as bs
 from artemis_edge._jit import kernel
 from artemis_edge.block_store import (
     ALIVE,
-    BLOCK,
     CARVED,
     CONFIRMED,
     COUNT,
@@ -27,8 +26,8 @@ from artemis_edge.block_store import (
     IZ,
     NORMAL,
     PENDING,
-    REFUSED_POINTS,
     POSITION,
+    REFUSED_POINTS,
     ROUGHNESS,
     SEEN,
     SQUARE,
@@ -47,6 +46,8 @@ from artemis_edge.frames import F32, F64, I32, U8, TrackedFrame
 POOL_FULL = -1
 # A cell with this much evidence no longer asks for re-meshing: its mean moves by less than sigma / 8
 SETTLED_COUNT = 64.0
+# A plane may be this much thicker than sigma^2: the noise of the angles adds to that of the range
+THICK = 1.0
 # Fewer hits lie on some plane by chance: three always do
 TRUSTED_COUNT = 6.0
 # A living vertex gives way below this share of the distance that a new one must keep: what a few hits put apart,
@@ -261,7 +262,9 @@ def refresh_voxel(store: Store, v: int, stamp: int, rules: RefreshRules, w: Refr
         p[POSITION] += x0
         p[POSITION + 1] += y0
         p[POSITION + 2] += z0
-        if state[s] == ALIVE and _is_crowded(store, w.grid, w.slot, w.code[i], s, STAYS * rules.min_distance_m):
+        if state[s] == ALIVE and _is_crowded(
+            store, w.grid, w.slot, w.code[i], s, STAYS * rules.min_distance_m
+        ):
             state[s] = EVIDENCE_ONLY
             _tell_neighbours(store, w.neighbour, X, Y, Z, AT_ONCE, stamp)
         elif (
@@ -351,7 +354,7 @@ def _fit_vertex(own: F64, total: F64, wide: F64, plane_sigma_m: float, eigen: F6
     (a crease, a bush) it goes onto the near plane only by the share sigma^2 / lambda_0, because there a plane
     would cut the corner (measured: ungated vertices are worse than raw ones at creases).
     """
-    sigma2 = plane_sigma_m * plane_sigma_m
+    sigma2 = THICK * plane_sigma_m * plane_sigma_m
     k = 1.0 / own[0]
     mx, my, mz = own[1] * k, own[2] * k, own[3] * k
     gx, gy, gz = _plane(total, eigen)
@@ -362,7 +365,7 @@ def _fit_vertex(own: F64, total: F64, wide: F64, plane_sigma_m: float, eigen: F6
     share = 0.0
     if flat and l0 <= sigma2 and total[0] >= TRUSTED_COUNT:
         share = 1.0
-    elif wide[7] > 4.0 * wide[6] and wide[6] <= max(1.5 * l0, 2.25 * sigma2):
+    elif wide[7] > 4.0 * wide[6] and wide[6] <= 1.5 * max(l0, sigma2):
         gx, gy, gz = wide[0], wide[1], wide[2]
         nx, ny, nz = wide[3], wide[4], wide[5]
         share = 1.0

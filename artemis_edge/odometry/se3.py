@@ -72,7 +72,7 @@ def log(T: F64) -> F64:
     scale = angle / sine if sine > _SMALL else 2.0 + sine**2 / 3.0
     twist = np.empty(6)
     twist[3:] = scale * q[:3]
-    if angle < _SMALL:
+    if angle < _SMALL:  # noqa: SIM108
         d = 1.0 / 12.0 + angle**2 / 720.0
     else:
         d = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
