@@ -45,6 +45,7 @@ MARGIN_CELLS = 1
 MOST_VERTICES = 192  # a voxel and its margin; more (dense foliage) are left out, nearest first
 MOST_TRIANGLES = 512
 FLUSHES = 16  # rounds of the flush; the third finds next to nothing
+FLUSH_PART = 4096  # voxels meshed at a time, so that their neighbours fit into memory
 MOST_GROUPS = 2  # a voxel may hold both sides of a thin wall
 EAR = 1 << 15  # flag in the first code of a triangle that only fills a gap
 
@@ -653,7 +654,8 @@ class Mesher:
             n = choose_batch(self._map.store, stamp, self._schedule, True, batch)
             if n == 0:
                 return
-            self._mesh(batch[:n], stamp)
+            for first in range(0, n, FLUSH_PART):
+                self._mesh(batch[first : min(first + FLUSH_PART, n)], stamp)
 
     @property
     def waiting(self) -> int:

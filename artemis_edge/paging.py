@@ -29,7 +29,12 @@ from artemis_edge.block_store import (
     SEEN,
     Store,
 )
+from artemis_edge.errors import RunError
 from artemis_edge.frames import F32, I32, I64, U8, Bool
+from artemis_edge.voxel_map import AT_ONCE
+
+TIGHT = 0.85  # share of a pool from which on blocks go to disk
+BUSY_FRAMES = 50  # a block seen this lately is not sent to disk
 
 _HEADER = struct.Struct("<4sIiiiIII")
 _MAGIC = b"AEP1"
@@ -236,12 +241,15 @@ def restore_block(
                 for q in range(8):
                     store.vertex[s, q] = vertex[j, q]
             j += 1
-        if store.voxel[v, PATCH_LEN] == 0 and not bs.set_patch(
+        fits = store.voxel[v, PATCH_LEN] > 0 or bs.set_patch(
             store, v, triangle[k : k + n_triangles[i]], n_triangles[i]
-        ):
-            return False
+        )
+        if not fits:  # it is meshed again when there is room
+            store.voxel[v, FRESH] += AT_ONCE
+            bs.enqueue(store, v, stamp)
         k += n_triangles[i]
-    store.block[block, SEEN] = stamp
+    # most come back because a neighbour needs them, and may go again soon
+    store.block[block, SEEN] = max(store.block[block, SEEN], stamp - BUSY_FRAMES + 5)
     return True
 
 
@@ -341,7 +349,7 @@ def page_from_bytes(data: bytes) -> Page:
             raise ValueError("page cut off")
         arrays.append(np.frombuffer(data, kind, count, at).reshape(shape))
         at += count * np.dtype(kind).itemsize
-    if at != len(data) or arrays[2].sum() != c or arrays[3].sum() != t:
+    if arrays[2].sum() != c or arrays[3].sum() != t:
         raise ValueError("page does not add up")
     return Page(np.array([[bx, by, bz]], np.int32), np.array([v], np.int32), *arrays)
 
@@ -417,6 +425,9 @@ class Pager:
         self._slots = np.empty(store.block.shape[0], np.int32)
         self.paged_out = 0
         self.paged_in = 0
+        # Times a neighbour could not come back: the budget is too small for one frame's surroundings, and patches
+        # at that border may not meet
+        self.left_on_disk = 0
 
     def resident(self) -> I32:
         """Slots of resident blocks, sorted by key."""
@@ -430,14 +441,23 @@ class Pager:
         block = self._store.block[touched, BX : BX + 3]
         around = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)
         keys = np.unique(block_keys((block[:, None] + around[None]).reshape(-1, 3).astype(np.int32)))
-        for key in np.intersect1d(keys, self.file.keys(), assume_unique=True).tolist():
-            self._restore(key, stamp)
+        wanted = np.intersect1d(keys, self.file.keys(), assume_unique=True).tolist()
+        own = set(block_keys(block).tolist())
+        if wanted:
+            self._store.block[touched, SEEN] = stamp
+        for key in wanted:
+            if self.fill() > 0.9:  # of what is in memory only what this frame needs must stay
+                self.make_room(stamp, busy_frames=BUSY_FRAMES - 10)
+            if self.fill() > 0.95 and key not in own:
+                self.left_on_disk += 1
+            else:
+                self._restore(key, stamp)
 
-    def make_room(self, stamp: int, busy_frames: int = 50) -> None:
+    def make_room(self, stamp: int, busy_frames: int = BUSY_FRAMES) -> None:
         """Send blocks to disk when a pool is 85 % full, until it is 70 % full; never one seen lately."""
         if self._store.counter[bs.N_TRIANGLES] > 0.85 * len(self._store.triangle):
             self._compact()
-        if self.fill() < 0.85:
+        if self.fill() < TIGHT:
             return
         slots = self.resident()
         seen = self._store.block[slots, SEEN]
@@ -449,6 +469,12 @@ class Pager:
                 self.file.put(int(slot_keys(self._store, one)[0]), pack(self._store, one))
                 bs.remove_block(self._store, slot)
                 self.paged_out += 1
+
+    def prepare(self, blocks: I32, stamp: int) -> None:
+        """Have the neighbours of blocks in memory whose patches are about to change."""
+        if len(self.file) > 0:
+            self.make_room(stamp)
+            self.bring_back(blocks, stamp)
 
     def _compact(self) -> None:
         """Move all patches together: rooms of the wrong size would else be free and of no use."""
@@ -498,8 +524,7 @@ class Pager:
             page.triangle,
         )
         if not fits:
-            raise MemoryError(
+            raise RunError(
                 "the memory budget is too small for what is in view; raise voxel_map.memory_budget_mb"
             )
-        self._store.block[slot, CHANGED] = stamp
         self.paged_in += 1

@@ -14,7 +14,7 @@ from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame
 from artemis_edge.map_writer import save_map, write_mesh
 from artemis_edge.mesher import Mesher
-from artemis_edge.paging import Pager
+from artemis_edge.paging import TIGHT, Pager
 from artemis_edge.visibility import FreeSpace
 from artemis_edge.voxel_map import VoxelMap
 
@@ -31,7 +31,7 @@ class Pipeline:
         self.voxel_map = VoxelMap(config.voxel_map, (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6)
         self.free_space = FreeSpace(config.voxel_map, self.voxel_map)
         self.pager = Pager(self.voxel_map.store, page_folder)
-        self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.bring_back)
+        self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.prepare)
         self.outbox = Outbox(self.voxel_map.store)
         self.trajectory: list[tuple[int, F64]] = []
         self.stage_ms: dict[str, float] = {}
@@ -51,7 +51,9 @@ class Pipeline:
         with self._stage("mesher"):
             self.mesher.update(active, self._stamp)
         with self._stage("delta"):
-            delta = self.outbox.changed(frame.index)
+            # what goes to disk must have been told
+            tight = self.pager.fill() >= TIGHT
+            delta = self.outbox.everything(frame.index) if tight else self.outbox.changed(frame.index)
             self.pager.make_room(self._stamp)
         self.trajectory.append((tracked.stamp_ns, tracked.T_world_lidar))
         return delta
@@ -70,6 +72,7 @@ class Pipeline:
         counts = {
             "points_without_memory": int(self.voxel_map.store.counter[REFUSED_POINTS]),
             "patches_without_memory": self.mesher.refused,
+            "blocks_without_memory": self.pager.left_on_disk,
         }
         return {reason: n for reason, n in counts.items() if n}
 

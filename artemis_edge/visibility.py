@@ -187,8 +187,7 @@ def _carve_block(
             e = store.evidence[s]
             # the mean of the cell's points: a vertex may not have been made of them yet
             k = 1.0 / e[COUNT]
-            x, y, z = (c >> 4) + 0.5, ((c >> 2) & 3) + 0.5, (c & 3) + 0.5
-            dx = (4 * store.voxel[v, IX] + x) * cell_m + k * e[SUM] - ox
+            dx = (4 * store.voxel[v, IX] + (c >> 4) + 0.5) * cell_m + k * e[SUM] - ox
             dy = (4 * store.voxel[v, IY] + ((c >> 2) & 3) + 0.5) * cell_m + k * e[SUM + 1] - oy
             dz = (4 * store.voxel[v, IZ] + (c & 3) + 0.5) * cell_m + k * e[SUM + 2] - oz
             face, row, column = pixel(

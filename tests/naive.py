@@ -152,8 +152,8 @@ class SmallMapper:
     ) -> None:
         self.voxel_map = VoxelMap(voxel_map or VoxelMapConfig(), budget_bytes)
         self.store = self.voxel_map.store
-        self.mesher = Mesher(mesher or MesherConfig(), self.voxel_map)
         self.pager = Pager(self.store, folder)
+        self.mesher = Mesher(mesher or MesherConfig(), self.voxel_map, self.pager.prepare)
         self.stamp = 0
 
     def add(self, points: F64, sensor: Iterable[float] = (0.0, 0.0, 0.0)) -> None:

@@ -78,22 +78,12 @@ def test_all_deltas_together_are_the_map(tmp_path: Path) -> None:
     assert len(pipeline.outbox.everything(0).block) == 0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="_settle_ears takes triangles from a neighbour's block without marking that block CHANGED",
-)
 def test_all_deltas_together_are_exactly_the_map(tmp_path: Path) -> None:
     places = naive.walk(40.0, 0.5)
     pipeline = naive.small_pipeline(tmp_path, places, 60)
     _run(pipeline, places).assert_shows(pipeline)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="make_room sends blocks to disk that changed and were not told yet",
-)
 def test_blocks_on_disk_were_told_before_they_went(tmp_path: Path) -> None:
     places = naive.walk(70.0, 0.5)[:140]
     pipeline = naive.small_pipeline(tmp_path, places)

@@ -74,11 +74,6 @@ def test_plane_has_no_holes_and_its_own_area(tmp_path: Path, x: float, sigma: fl
     assert (mesh.normals @ towards > 0.5).all()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="ownership by the moving centroid loses triangles on a voxel's face; remove when owned by cells",
-)
 @pytest.mark.parametrize("x", [3.2, -4.0])
 def test_plane_on_the_border_of_voxels_is_whole_too(tmp_path: Path, x: float) -> None:
     mapper = _map(tmp_path, _wall(1, x))
@@ -168,14 +163,7 @@ def test_gap_wider_than_the_longest_edge_stays_open(tmp_path: Path) -> None:
     assert _edge_lengths(mesh).max() < LONG_EDGE_M + EDGE_SLACK_M
 
 
-BACK_FACES = pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="_fill_ears closes the outer loop of a lone triangle by its back; remove when it asks for _turn",
-)
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, pytest.param(3, marks=BACK_FACES)])
+@pytest.mark.parametrize("n", [0, 1, 2, 3])
 def test_few_points_are_harmless(tmp_path: Path, n: int) -> None:
     points = np.array([[3.05, 0.05, 1.05], [3.05, 0.15, 1.05], [3.05, 0.05, 1.15]])[:n]
     mapper = _map(tmp_path, [points, points[:0], points, points])
@@ -184,7 +172,9 @@ def test_few_points_are_harmless(tmp_path: Path, n: int) -> None:
     assert mapper.mesher.waiting == 0 and mapper.mesher.refused == 0
 
 
-@BACK_FACES
+@pytest.mark.xfail(
+    strict=False, reason="a second group of the other direction can close a triangle by its back"
+)
 def test_no_triangle_is_closed_by_its_own_back(tmp_path: Path) -> None:
     rng = np.random.default_rng(11)
     mapper = _map(tmp_path, [rng.uniform((2, -2, 0), (6, 2, 3), (600, 3)) for _ in range(6)])

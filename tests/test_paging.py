@@ -12,6 +12,9 @@ from artemis_edge.frames import I64
 from artemis_edge.paging import Page, PageFile, block_keys, pack, page_bytes, page_from_bytes
 from tests import naive
 
+# Holds what the sensor sees in the corridor and half as much again, not the corridor
+SMALL_MB = 12
+
 
 @pytest.fixture(autouse=True)
 def _closed_files() -> Iterator[None]:
@@ -167,6 +170,7 @@ def test_waiting_and_lately_seen_blocks_stay(tmp_path: Path) -> None:
             mapper.add(points.scans[0].points + np.array([k * 1.0, 0, 0]), (k * 1.0, 0, 0))
     waiting = mapper.mesher.waiting
     assert mapper.pager.fill() > 0.85 and waiting > 0
+    mapper.store.block[:, bs.CHANGED] = 0  # as if all had been told
     mapper.pager.make_room(mapper.stamp, busy_frames=20)
     assert mapper.pager.paged_out > 0
     assert mapper.mesher.waiting == waiting
@@ -178,7 +182,7 @@ def test_waiting_and_lately_seen_blocks_stay(tmp_path: Path) -> None:
 def test_long_corridor_in_little_memory_is_the_corridor_in_much(tmp_path: Path) -> None:
     places = naive.walk(70.0, 0.5)
     area = {}
-    for budget_mb in (0, 60):
+    for budget_mb in (SMALL_MB, 60):
         pipeline = naive.small_pipeline(tmp_path / str(budget_mb), places, budget_mb)
         for frame in naive.corridor(places):
             pipeline.process(frame)
@@ -186,20 +190,15 @@ def test_long_corridor_in_little_memory_is_the_corridor_in_much(tmp_path: Path) 
         triangles = naive.all_triangles(pipeline.pager)
         naive.assert_manifold(triangles)
         assert set(triangles.ravel().tolist()) <= naive.living_vertices(pipeline.pager).keys()
-        assert (pipeline.pager.paged_out > 50 and pipeline.pager.paged_in > 20) == (budget_mb == 0)
+        assert (pipeline.pager.paged_out > 10 and pipeline.pager.paged_in > 5) == (budget_mb == SMALL_MB)
         assert "points_without_memory" not in pipeline.lost
         area[budget_mb] = naive.area(naive.raw_mesh(pipeline.pager))
-    assert area[0] == pytest.approx(area[60], rel=0.05)
+    assert area[SMALL_MB] == pytest.approx(area[60], rel=0.05)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="triangle pool: rooms of another grade count as free but cannot be used; fill() stays below 85 %",
-)
 def test_a_pool_that_is_not_full_refuses_no_patch(tmp_path: Path) -> None:
     places = naive.walk(70.0, 0.5)
-    pipeline = naive.small_pipeline(tmp_path, places)
+    pipeline = naive.small_pipeline(tmp_path, places, SMALL_MB)
     for frame in naive.corridor(places):
         pipeline.process(frame)
     assert pipeline.pager.paged_out > 0
@@ -225,11 +224,6 @@ def _carve_beside_blocks_on_disk(folder: Path, seed: int) -> None:
     naive.assert_manifold(naive.all_triangles(mapper.pager))
 
 
-@pytest.mark.xfail(
-    strict=False,
-    raises=AssertionError,
-    reason="a voxel is meshed although a neighbour's block is on disk, whose edges it cannot see",
-)
 def test_meshing_beside_a_block_on_disk_stays_manifold(tmp_path: Path) -> None:
     for seed in range(8):
         _carve_beside_blocks_on_disk(tmp_path / str(seed), seed)

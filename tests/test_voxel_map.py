@@ -278,7 +278,7 @@ def test_new_vertices_tell_only_the_neighbours_that_see_them() -> None:
     store.voxel[:27, bs.AT_MESH] = 1
     for cell in ((0, 1, 2), (3, 3, 3), (1, 2, 1), (0, 0, 3)):
         store.voxel[:27, bs.FRESH] = 0
-        vm._tell_neighbours(store, neighbour, *cell, 5)
+        vm._tell_neighbours(store, neighbour, *cell, 1, 5)
         for k, u in enumerate(neighbour):
             d = (k // 9 - 1, (k // 3) % 3 - 1, k % 3 - 1)
             sees = all(s == 0 or c == (0 if s < 0 else 3) for s, c in zip(d, cell, strict=True))

@@ -23,9 +23,10 @@ class RunStatistics:
     ``frame_ms`` wall time from the frame handed in to its delta ready; ``cpu_ms`` CPU time (user + system) of
     all threads that run the stages; ``stage_ms`` wall time by stage, in the order of the pipeline.
     ``flush_ms`` is the postponed work done once after the last frame, ``warmup_s`` what came before the first
-    frame; neither is in ``frame_ms``, but ``flush_cpu_ms`` is part of the mean CPU time. ``frames_dropped``
-    were in the input and are not in the map, ``lost`` says what and why, by reason. ``input_hz`` 0 when the input has no rate. ``peak_rss_mb`` is measured when
-    the report is written unless it is set.
+    frame; neither is in ``frame_ms``, but ``flush_cpu_ms`` is part of the mean CPU time.
+    ``frames_dropped`` were in the input and are not in the map, ``lost`` says what and why, by
+    reason. ``input_hz`` 0 when the input has no rate. ``peak_rss_mb`` is measured when the report is
+    written unless it is set.
     """
 
     input_name: str = ""
