@@ -152,7 +152,7 @@ def test_file_without_permission(
 def test_output_that_cannot_be(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert "is a file" in refused(capsys, 2, "reprocess", kitti, "--out", tmp_path / "file")
-    assert "there is no folder" in refused(capsys, 2, "reprocess", kitti, "--out", tmp_path / "a" / "b")
+    assert "cannot write to" in refused(capsys, 2, "reprocess", kitti, "--out", tmp_path / "file" / "b")
 
 
 def test_full_disk_keeps_what_fits(

@@ -191,10 +191,10 @@ def test_output_folders_that_cannot_be(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="is a file"):
         prepare(tmp_path / "file")
-    with pytest.raises(InputError, match="there is no folder"):
-        prepare(tmp_path / "a" / "b")
-    prepare(tmp_path / "a")
-    assert (tmp_path / "a").is_dir()
+    with pytest.raises(InputError, match="cannot write to"):
+        prepare(tmp_path / "file" / "b")
+    prepare(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir()
 
 
 def test_several_inputs_have_folders_of_their_own(

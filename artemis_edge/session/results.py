@@ -63,13 +63,11 @@ def disk_sentence(place: Path, error: OSError) -> str:
 
 
 def prepare(folder: Path) -> None:
-    """Create ``folder`` for results if it is not there; InputError if it cannot be one."""
+    """Create ``folder`` (and those above it) for results if it is not there; InputError if it cannot be one."""
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; --out needs a folder")
-    if not folder.exists() and not folder.resolve().parent.is_dir():
-        raise InputError(f"there is no folder {folder.resolve().parent}; create it or choose another --out")
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
