@@ -713,14 +713,14 @@ def test_real_hall() -> None:
 @pytest.mark.parametrize("name", ["nav2_turtlebot.mcap", "tf_example", "tf_example.bag", "ROS_example.bag"])
 def test_real_bags_without_lidar(name: str) -> None:
     from artemis_edge.datasets.bag import WHOLE
-    from artemis_edge.datasets.rosbag import _open_bags
+    from artemis_edge.datasets.rosbag import open_bags
 
     path = DATA / "evo_bags" / name
     with pytest.raises(InputError, match="no LiDAR clouds"):
         open_input(path)
     ours = sorted(
         (entry.connection.topic, entry.log_ns, bytes(entry.data)[:200])
-        for bag in _open_bags(path)
+        for bag in open_bags(path)
         for entry in bag.scan(lambda _connection: WHOLE)
     )
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
