@@ -21,6 +21,7 @@ from artemis_edge.block_store import (
     PATCH_LEN,
     POSITION,
     Store,
+    block_key,
 )
 from artemis_edge.frames import F32, I32, I64, MeshDelta
 from artemis_edge.paging import EAR_MASK
@@ -56,16 +57,13 @@ def count_delta(store: Store, slots: I32, vertex_start: I64, triangle_start: I64
 
 
 @kernel
-def vertex_id(x: int, y: int, z: int) -> int:
-    """Name of the vertex in cell (x, y, z) of the world: 21 bits each, as ``paging.Page.vertex_ids``."""
-    return ((int(x) + 1048576) << 42) | ((int(y) + 1048576) << 21) | (int(z) + 1048576)
-
-
-@kernel
 def fill_delta(
     store: Store, slots: I32, ids: I64, position: F32, normal: F32, sure: F32, triangles: I64
 ) -> None:
-    """Copy living vertices and triangles of blocks, in the order of ``slots``."""
+    """Copy living vertices and triangles of blocks, in the order of ``slots``.
+
+    A vertex is named by its cell as a block is by its place: see ``paging.Page.vertex_ids``.
+    """
     i = j = 0
     for slot in slots:
         for inner in range(512):
@@ -77,7 +75,7 @@ def fill_delta(
                 s = store.voxel_cell[v, c]
                 if s < 0 or store.state[s] != ALIVE:
                     continue
-                ids[i] = vertex_id(x + (c >> 4), y + ((c >> 2) & 3), z + (c & 3))
+                ids[i] = block_key(x + (c >> 4), y + ((c >> 2) & 3), z + (c & 3))
                 for k in range(3):
                     position[i, k] = store.vertex[s, POSITION + k]
                     normal[i, k] = store.vertex[s, NORMAL + k]
@@ -87,7 +85,7 @@ def fill_delta(
             for t in range(at, at + store.voxel[v, PATCH_LEN]):
                 for k in range(3):
                     code = np.int64(store.triangle[t, k]) & EAR_MASK
-                    triangles[j, k] = vertex_id(
+                    triangles[j, k] = block_key(
                         x + (code >> 10) - 12, y + ((code >> 5) & 31) - 12, z + (code & 31) - 12
                     )
                 j += 1

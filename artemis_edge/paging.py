@@ -62,6 +62,20 @@ class Page:
     state: U8
     triangle: np.ndarray
 
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """What a block holds, in the order in which kernels take it and bytes keep it."""
+        return (
+            self.inner,
+            self.meta,
+            self.n_cells,
+            self.n_triangles,
+            self.cell,
+            self.evidence,
+            self.vertex,
+            self.state,
+            self.triangle,
+        )
+
     def voxel_index(self) -> I64:
         """Voxel coordinates int64 (v, 3)."""
         base = np.repeat(self.block.astype(np.int64) * 8, self.n_voxels, axis=0)
@@ -182,15 +196,7 @@ def pack(store: Store, slots: I32) -> Page:
     fill_page(
         store,
         slots,
-        page.inner,
-        page.meta,
-        page.n_cells,
-        page.n_triangles,
-        page.cell,
-        page.evidence,
-        page.vertex,
-        page.state,
-        page.triangle,
+        *page.arrays(),
     )
     return page
 
@@ -310,18 +316,7 @@ def page_bytes(page: Page) -> bytes:
     head = _HEADER.pack(
         _MAGIC, len(page.inner), *page.block[0].tolist(), len(page.cell), len(page.triangle), 0
     )
-    parts = (
-        page.inner,
-        page.meta,
-        page.n_cells,
-        page.n_triangles,
-        page.cell,
-        page.evidence,
-        page.vertex,
-        page.state,
-        page.triangle,
-    )
-    return head + b"".join(np.ascontiguousarray(p).tobytes() for p in parts)
+    return head + b"".join(np.ascontiguousarray(a).tobytes() for a in page.arrays())
 
 
 def page_from_bytes(data: bytes) -> Page:
@@ -513,15 +508,7 @@ class Pager:
             self._store,
             slot,
             stamp,
-            page.inner,
-            page.meta,
-            page.n_cells,
-            page.n_triangles,
-            page.cell,
-            page.evidence,
-            page.vertex,
-            page.state,
-            page.triangle,
+            *page.arrays(),
         )
         if not fits:
             raise RunError(
