@@ -91,9 +91,6 @@ class Workspace(NamedTuple):
     frame: F64  # (3, 3) rows: first axis, second axis, direction
     direction: F64  # (MOST_GROUPS, 3)
     out: F64  # (3,)
-    tally: NDArray[
-        np.int64
-    ]  # (8,) 0 voxels, 1 vertices, 2 accepted, 3 edge taken, 4 too long, 5 normals, 6 ears
 
 
 def workspace() -> Workspace:
@@ -127,7 +124,6 @@ def workspace() -> Workspace:
         frame=np.empty((3, 3)),
         direction=np.empty((MOST_GROUPS, 3)),
         out=np.empty(3),
-        tally=np.zeros(8, np.int64),
     )
 
 
@@ -159,9 +155,6 @@ def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace)
             w.patch[i, k] = w.local_code[w.triangles[i, k]]
         if i >= plain:
             w.patch[i, 0] |= EAR
-    w.tally[0] += 1
-    w.tally[1] += n
-    w.tally[2] += triangles
     return bs.set_patch(store, v, w.patch, triangles)
 
 
@@ -258,7 +251,6 @@ def _settle_ears(store: Store, ears: int, w: Workspace, edges: int) -> int:
             last = at + store.voxel[u, PATCH_LEN]
             for k in range(3):
                 store.triangle[at + t, k] = store.triangle[last, k]
-            w.tally[7] += 1
         else:
             edges = _use_edges(w, a, b, c, edges)
     return edges
@@ -356,7 +348,6 @@ def _mesh_group(n: int, rules: Rules, w: Workspace, triangles: int, edges: int) 
             if not _is_owned(a, b, c, w.local_code) or not is_surface(a, b, c, rules, w):
                 continue
             if w.edge[a, b] or w.edge[b, c] or w.edge[c, a]:
-                w.tally[3] += 1
                 continue
             triangles, edges = _accept(a, b, c, w, triangles, edges)
     for i in range(m):
@@ -403,7 +394,6 @@ def is_surface(a: int, b: int, c: int, rules: Rules, w: Workspace) -> bool:
     """Whether a triangle is surface: its edges against its evidence, its normal against its vertices'."""
     longest = max(_edge2(w.position, a, b), _edge2(w.position, b, c), _edge2(w.position, c, a))
     if longest > rules.long_edge_m * rules.long_edge_m:
-        w.tally[4] += 1
         return False
     p, q, r = w.position[a], w.position[b], w.position[c]
     ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
@@ -417,12 +407,10 @@ def is_surface(a: int, b: int, c: int, rules: Rules, w: Workspace) -> bool:
         g = w.normal[i]
         agreement = min(agreement, (nx * g[0] + ny * g[1] + nz * g[2]) / length)
     if agreement < rules.agreement:
-        w.tally[5] += 1
         return False
     if longest > rules.short_edge_m * rules.short_edge_m:
         least = min(w.evidence[a], w.evidence[b], w.evidence[c])
         if least < rules.well_seen and agreement < rules.coplanar:
-            w.tally[4] += 1
             return False
     return True
 
@@ -461,7 +449,6 @@ def _fill_ears(n: int, d: F64, rules: Rules, w: Workspace, triangles: int, edges
                 and _is_empty(b, a, x, n, d, w.position)
             ):
                 triangles, edges = _accept(b, a, x, w, triangles, edges)
-                w.tally[6] += 1
                 if w.edge[b, x] == 0:
                     holes = _add_hole(w, b, x, holes)
     return triangles, edges
