@@ -22,7 +22,8 @@ U16 = NDArray[np.uint16]
 WHITE = (1.0, 1.0, 1.0)
 Colour = tuple[float, float, float]
 
-#: Class names of all virtual worlds; the index is the label. 0 means "nothing of the others".
+#: Class names that all virtual worlds share; the index is the label, 0 is "nothing of the others". Indoors the
+#: floor is ground, walls and ceilings are building. A loaded world may add names after these.
 CLASS_NAMES = (
     "background",
     "ground",
@@ -34,6 +35,17 @@ CLASS_NAMES = (
     "pole",
     "sign",
     "other",
+    "bicycle",
+    "backpack",
+    "statue",
+    "hedge",
+    "steps",
+    "shelf",
+    "glass",
+    "pillar",
+    "table",
+    "chair",
+    "railing",
 )
 
 

@@ -36,6 +36,8 @@ class TextureArrays(NamedTuple):
     ``texels`` int32 (n,) red, green << 8, blue << 16; ``start`` int64 (materials, LEVELS) first texel of a
     mip level (square pictures of SIZE >> level pixels); per material float32: ``metres`` width of a picture,
     ``reflectivity`` 0..1 at 905 nm, ``gloss`` 0..1 share of mirrored sky, ``mean_luma`` brightness 0..255.
+    ``glass`` bool (materials,): a LiDAR beam passes (but for what is mirrored) and meets what lies behind; the
+    camera sees the material's picture, which shows what is behind the pane.
     """
 
     texels: I32
@@ -44,6 +46,7 @@ class TextureArrays(NamedTuple):
     reflectivity: F32
     gloss: F32
     mean_luma: F32
+    glass: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,6 +349,7 @@ class _Recipe:
     metres: float
     reflectivity: float  # at 905 nm; typical values of diffuse building materials, an assumption
     gloss: float = 0.0
+    glass: bool = False
 
 
 def _recipes() -> dict[str, _Recipe]:
@@ -369,6 +373,7 @@ def _recipes() -> dict[str, _Recipe]:
         "metal": _Recipe(_metal, 0.6, 0.4, 0.08),
         "car_paint": _Recipe(_paint, 1.7, 0.35, 0.1),
         "glass": _Recipe(_glass, 1.3, 0.08, 0.22),
+        "pane": _Recipe(_glass, 1.3, 0.08, 0.3, glass=True),
         "rubber": _Recipe(_plastic, 0.4, 0.06),
         "plastic": _Recipe(_plastic, 0.5, 0.35, 0.05),
         "bark": _Recipe(_bark, 0.7, 0.35),
@@ -418,5 +423,6 @@ def build_atlas(seed: int) -> TextureAtlas:
         np.array([r.reflectivity for r in recipes.values()], np.float32),
         np.array([r.gloss for r in recipes.values()], np.float32),
         luma,
+        np.array([r.glass for r in recipes.values()], np.bool_),
     )
     return TextureAtlas(arrays, {name: m for m, name in enumerate(recipes)})

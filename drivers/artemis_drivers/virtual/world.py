@@ -7,12 +7,25 @@ that a walk of twenty minutes through ever new places needs only the blocks arou
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from artemis_drivers.virtual.mesh_builder import CLASS_NAMES, F64, WorldMesh, joined
+from artemis_drivers.virtual.motion import Motion
 from artemis_drivers.virtual.textures import TextureAtlas
+
+
+@dataclass(frozen=True, slots=True)
+class Mover:
+    """Something that moves through the world as one rigid body.
+
+    ``mesh`` in the body's own frame, metres (x ahead, z up, on the ground at z = 0); ``motion`` gives
+    T_world_mover over time. Times beyond the motion's ends stand for its ends.
+    """
+
+    mesh: WorldMesh
+    motion: Motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +33,11 @@ class World:
     """A seeded world.
 
     ``block_edges`` float64 (blocks + 1,): block k covers x in ``block_edges[k]..block_edges[k + 1]`` metres;
-    ``build_block(k)`` makes its triangles; ``path`` float64 (n, 3) is the line a walker's eyes follow,
-    metres; ``sun`` unit vector towards the sun.
+    ``build_block(k)`` makes its triangles; ``sun`` unit vector towards the sun; ``movers`` are in no block.
+
+    ``path`` float64 (n, 3), metres, is the line a walker's eyes follow: points at most 0.5 m apart, nothing
+    but movers within 0.3 m of it. It may climb stairs (z changes). ``looks_at`` float64 (m, 3) are places
+    worth a look; there may be none.
     """
 
     name: str
@@ -32,6 +48,8 @@ class World:
     sun: F64
     atlas: TextureAtlas
     class_names: tuple[str, ...] = CLASS_NAMES
+    movers: tuple[Mover, ...] = ()
+    looks_at: F64 = field(default_factory=lambda: np.empty((0, 3)))
 
     @property
     def block_count(self) -> int:
