@@ -1,4 +1,9 @@
-"""The part of a world around the sensors, prepared for ray casting and for shading."""
+"""The part of a world around the sensors, prepared for ray casting and for shading.
+
+All triangles of a scene have one numbering: those that stand still first, then those of each mover. A surface
+is described in the local frame of the part it belongs to: axes of the world and ``Scene.origin`` for what stands
+still, the mover's own frame (``MovingPart.pose``) for what moves.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8, WorldMesh, joined
-from artemis_drivers.virtual.raycast import Bvh, build_bvh
+from artemis_drivers.virtual.moving import MovingPart, cast_mover, into_mover, prepare_movers, renumbered
+from artemis_drivers.virtual.raycast import Bvh, Hits, build_bvh, cast
 from artemis_drivers.virtual.textures import MACRO_M, SIZE, TextureAtlas
-from artemis_drivers.virtual.world import World
+from artemis_drivers.virtual.world import Mover, World
 
 
 class Surface(NamedTuple):
-    """What shading needs of each triangle, packed into few cache lines, relative to ``Scene.origin``.
+    """What shading needs of each triangle, packed into few cache lines, in the local frame of its part.
 
     ``rows`` float32 (m, 16): 0-3 unit normal n and n.p of its points; 4-7 and 8-11 texture u and v in metres
     as affine functions of p; 12 texels per metre of the picture on this triangle; 13-14 metres added to the
@@ -32,8 +38,10 @@ class Surface(NamedTuple):
 class Scene:
     """Triangles around the sensors; ``origin`` float64 (3,) of the float32 coordinates in ``surface``.
 
-    ``object_of`` int32 (m,) numbers the objects 0..k - 1 of the triangles; ``object_centre`` float64 (k, 3),
-    local, and ``object_radius`` (k,) enclose them.
+    ``mesh``, ``bvh``, ``object_of``, ``object_centre`` and ``object_radius`` are of what stands still;
+    ``surface``, ``class_id`` uint8 and ``instance`` int32 have a row for every triangle, those of ``movers``
+    behind. ``object_of`` int32 (m,) numbers the objects 0..k - 1 of the triangles; ``object_centre`` float64
+    (k, 3), local, and ``object_radius`` (k,) enclose them.
     """
 
     mesh: WorldMesh
@@ -43,6 +51,9 @@ class Scene:
     object_of: I32
     object_centre: F64
     object_radius: F64
+    movers: tuple[MovingPart, ...]
+    class_id: U8
+    instance: I32
 
     @property
     def origin(self) -> F64:
@@ -50,10 +61,66 @@ class Scene:
         return self.bvh.origin
 
 
-def prepare(mesh: WorldMesh, atlas: TextureAtlas) -> Scene:
-    """Scene of a mesh."""
+def prepare(mesh: WorldMesh, atlas: TextureAtlas, movers: tuple[Mover, ...] = ()) -> Scene:
+    """Scene of a mesh and of what moves through it."""
+    return _assemble(mesh, atlas, prepare_movers(movers, len(mesh.triangles)))
+
+
+def _assemble(mesh: WorldMesh, atlas: TextureAtlas, movers: tuple[MovingPart, ...]) -> Scene:
     bvh = build_bvh(mesh.corners())
-    return Scene(mesh, bvh, _surface(mesh, atlas, bvh.origin), atlas, *_objects(mesh, bvh.origin))
+    parts = [(mesh, bvh.origin), *((m.mesh, m.bvh.origin) for m in movers)]
+    surfaces = [_surface(part, atlas, origin) for part, origin in parts]
+    return Scene(
+        mesh,
+        bvh,
+        Surface(*(np.concatenate(columns) for columns in zip(*surfaces, strict=True))),
+        atlas,
+        *_objects(mesh, bvh.origin),
+        movers,
+        np.concatenate([part.class_id for part, _ in parts]),
+        np.concatenate([part.instance for part, _ in parts]),
+    )
+
+
+def cast_at(
+    scene: Scene, origin: F64, direction: F64, time_s: F64 | float, max_range_m: F64 | float = np.inf
+) -> Hits:
+    """Nearest hit of each ray with the scene as it is at the ray's time.
+
+    ``origin``, unit ``direction`` float64 (n, 3) in world; ``time_s`` and ``max_range_m`` float64 (n,) or one
+    for all. ``Hits.triangle`` is of the scene's numbering. :func:`local_rays` carries what was met into the
+    frame in which ``Scene.surface`` describes it.
+    """
+    hits = cast(scene.bvh, origin, direction, max_range_m)
+    if not scene.movers:
+        return hits
+    time = np.ascontiguousarray(np.broadcast_to(np.asarray(time_s, np.float64), (len(origin),)))
+    limit = np.minimum(hits.distance_m, max_range_m)
+    for mover in scene.movers:
+        rows, met = cast_mover(mover, origin, direction, time, limit)
+        nearer = met.triangle >= 0
+        rows = rows[nearer]
+        limit[rows] = met.distance_m[nearer]
+        hits.distance_m[rows] = met.distance_m[nearer]
+        hits.triangle[rows] = met.triangle[nearer] + np.int32(mover.first)
+        hits.u[rows], hits.v[rows] = met.u[nearer], met.v[nearer]
+    return hits
+
+
+def local_rays(
+    scene: Scene, triangle: I32, point: F64, direction: F64, time_s: F64 | float
+) -> tuple[F64, F64]:
+    """Points and directions (n, 3) of the world in the local frame of the triangle's part at its time."""
+    local, turned = point - scene.origin, direction.copy()
+    if len(triangle) == 0 or int(triangle.max()) < len(scene.mesh.triangles):
+        return local, turned
+    time = np.broadcast_to(np.asarray(time_s, np.float64), (len(point),))
+    for mover in scene.movers:
+        rows = np.flatnonzero(
+            (triangle >= mover.first) & (triangle < mover.first + len(mover.mesh.triangles))
+        )
+        local[rows], turned[rows] = into_mover(mover, point[rows], direction[rows], time[rows])
+    return local, turned
 
 
 def _objects(mesh: WorldMesh, origin: F64) -> tuple[I32, F64, F64]:
@@ -111,6 +178,7 @@ class Window:
         self._blocks: dict[int, WorldMesh] = {}
         self._shown = range(0)
         self._scene: Scene | None = None
+        self._movers = prepare_movers(world.movers, 0)
 
     def at(self, x: float) -> Scene:
         """Scene around ``x``; the same object as long as the same blocks are in reach."""
@@ -119,6 +187,7 @@ class Window:
             self._blocks = {
                 k: self._blocks[k] if k in self._blocks else self.world.build_block(k) for k in wanted
             }
-            self._scene = prepare(joined([self._blocks[k] for k in wanted]), self.world.atlas)
+            mesh = joined([self._blocks[k] for k in wanted])
+            self._scene = _assemble(mesh, self.world.atlas, renumbered(self._movers, len(mesh.triangles)))
             self._shown = wanted
         return self._scene
