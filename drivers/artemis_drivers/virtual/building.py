@@ -13,6 +13,7 @@ from artemis_drivers.virtual.textures import SHOP_SIGNS
 
 Rng = np.random.Generator
 BELOW_GROUND = 0.8  # metres that a house reaches below the street
+_PANE_M = 0.012  # thickness of window panes
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +26,11 @@ class Hole:
     z1: float
     depth: float
     material: str
+
+    @property
+    def glazed(self) -> bool:
+        """Filled with a pane that beams pass."""
+        return self.material.startswith("window")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +61,20 @@ def random_style(rng: Rng) -> HouseStyle:
         tuple(warm),
         (0.72, 0.8, 0.82),
         (0.95, 0.85, 0.55),
-        (0.8, 0.62, 0.55),
+        (0.5, 0.68, 0.45),
+        (0.42, 0.5, 0.72),
+        (0.4, 0.4, 0.42),
+        (0.7, 0.25, 0.25),
+        tuple(rng.uniform(0.3, 1.0, 3)),
     ]
-    tint = np.array(tints[rng.integers(len(tints))]) * rng.uniform(0.85, 1.1)
+    tint = np.array(tints[rng.integers(len(tints))]) * rng.uniform(0.8, 1.1)
     base = np.array([1.0, 0.97, 0.92]) * rng.uniform(0.5, 0.85)
     return HouseStyle(
         wall=str(rng.choice(["brick_a", "brick_b", "plaster_a", "plaster_b"])),
         base=str(rng.choice(["stone", "plaster_b", "brick_b"])),
         wall_tint=(float(tint[0]), float(tint[1]), float(tint[2])),
         base_tint=(float(base[0]), float(base[1]), float(base[2])),
-        trim_tint=tuple(np.full(3, rng.uniform(0.6, 0.98)).tolist()),
+        trim_tint=tuple((rng.uniform(0.3, 0.98) * rng.uniform(0.85, 1.0, 3)).tolist()),
         ground_floor_m=float(rng.uniform(3.4, 4.2)),
         floor_m=float(rng.uniform(2.8, 3.3)),
         floors=int(rng.integers(2, 5)),
@@ -79,9 +89,16 @@ def add_house(builder: MeshBuilder, rng: Rng, T_world_house: F64, width: float, 
     _add_walls(builder, style, holes, T_world_house, width, depth)
     for hole in holes:
         _add_filling(builder, rng, style, hole, T_world_house)
+        if hole.glazed:
+            _add_room(builder, rng, hole, T_world_house)
     _add_trim(builder, style, holes, T_world_house, width)
     _add_roof(builder, rng, style, T_world_house, width, depth)
     _add_shop_signs(builder, rng, style, holes, T_world_house)
+    builder.begin("glass")
+    for hole in (h for h in holes if h.glazed):
+        pane = fitted_panel(hole.x1 - hole.x0, hole.z1 - hole.z0, _PANE_M)
+        T_pane = T_world_house @ pose(hole.x0, hole.depth, hole.z0)
+        builder.add(pane, (hole.material, "pane"), (1.0, 1.0, 1.0), T_pane)
 
 
 def _ground_floor(rng: Rng, style: HouseStyle, width: float) -> list[Hole]:
@@ -182,14 +199,13 @@ def fitted_panel(width: float, height: float, thickness: float) -> Shape:
 
 def _add_filling(builder: MeshBuilder, rng: Rng, style: HouseStyle, hole: Hole, T: F64) -> None:
     wide, high = hole.x1 - hole.x0, hole.z1 - hole.z0
-    filling = fitted_panel(wide, high, 0.05) if hole.material != "shutter" else panel(wide, high, 0.05)
-    tint: Colour = (1.0, 1.0, 1.0)
-    if hole.material in ("door", "shutter"):
-        shade = rng.uniform(0.3, 1.0, 3)
-        tint = (float(shade[0]), float(shade[1]), float(shade[2]))
-    builder.add(filling, (hole.material, "wood"), tint, T @ pose(hole.x0, hole.depth, hole.z0))
+    if not hole.glazed:
+        filling = fitted_panel(wide, high, 0.05) if hole.material != "shutter" else panel(wide, high, 0.05)
+        r, g, b = rng.uniform(0.3, 1.0, 3)
+        tint: Colour = (float(r), float(g), float(b))
+        builder.add(filling, (hole.material, "wood"), tint, T @ pose(hole.x0, hole.depth, hole.z0))
     frame = 0.06
-    if hole.material.startswith("window"):
+    if hole.glazed:
         bars = merged(
             [
                 box((0, -0.03, 0), (frame, 0.02, high)),
@@ -203,6 +219,23 @@ def _add_filling(builder: MeshBuilder, rng: Rng, style: HouseStyle, hole: Hole, 
         builder.add(sill, "concrete", style.trim_tint, T)
     if hole.z0 > style.ground_floor_m and rng.random() < 0.12:
         _add_balcony(builder, T @ pose(hole.x0 - 0.35, 0, hole.z0 - 0.75), wide + 0.7)
+
+
+def _add_room(builder: MeshBuilder, rng: Rng, hole: Hole, T: F64) -> None:
+    """What lies behind a pane: a curtain or blind close to it, or the room's far wall."""
+    y0 = hole.depth - 0.02
+    y1 = y0 + (rng.uniform(0.15, 0.5) if rng.random() < 0.5 else rng.uniform(1.5, 4.0))
+    a, b, c, d = hole.x0, hole.x1, hole.z0, hole.z1
+    back = [(a, y1, c), (b, y1, c), (b, y1, d), (a, y1, d)]
+    sides = [
+        [(a, y0, c), (a, y1, c), (a, y1, d), (a, y0, d)],
+        [(b, y1, c), (b, y0, c), (b, y0, d), (b, y1, d)],
+        [(a, y0, c), (b, y0, c), (b, y1, c), (a, y1, c)],
+        [(a, y1, d), (b, y1, d), (b, y0, d), (a, y0, d)],
+    ]
+    room = _quads(np.array([back, *sides], np.float64))
+    r, g, b_ = rng.uniform(0.3, 0.9, 3)
+    builder.add(room, "cloth", (float(r), float(g), float(b_)), T)
 
 
 def _add_balcony(builder: MeshBuilder, T: F64, width: float) -> None:
@@ -243,7 +276,7 @@ def _add_roof(builder: MeshBuilder, rng: Rng, style: HouseStyle, T: F64, width: 
     top = style.height_m
     profile = [(-out, top - 0.05), (depth + out, top - 0.05), (depth / 2, top + rise)]
     gable = prism(profile, -width, 0.0)  # profile runs along x: turn it so that it runs along y
-    tint = np.array([0.8, 0.42, 0.34]) if rng.random() < 0.6 else np.array([0.5, 0.5, 0.55])
+    tint = np.array([0.8, 0.42, 0.34]) if rng.random() < 0.6 else rng.uniform(0.4, 0.6, 3)
     builder.add(
         gable, ("roof", "plaster_a"), (tuple(tint.tolist()), style.wall_tint), T @ pose(yaw=np.pi / 2)
     )
@@ -292,7 +325,8 @@ def add_gate_wall(builder: MeshBuilder, rng: Rng, T: F64, width: float) -> None:
     gate = Hole(width / 2 - 0.6, width / 2 + 0.6, 0.02, 2.0, 0.12, "door")
     face = merged([_front([gate], width, -BELOW_GROUND, high), _reveal(gate)])
     body = _without_part(box((0, 0, -BELOW_GROUND), (width, 0.3, high)), 2)
-    tint = (0.9, 0.7, 0.6)
+    r, g, b = rng.uniform(0.5, 1.0, 3)
+    tint = (float(r), float(g), float(b))
     builder.add(face, "brick_b", tint, T)
     builder.add(body, "brick_b", tint, T)
     builder.add(

@@ -1,4 +1,4 @@
-"""Parked cars: a lofted body, a cabin with windows, wheels, lights, mirrors and number plates."""
+"""Cars: a lofted body, a cabin with windows and seats, wheels, lights, mirrors and number plates."""
 
 from __future__ import annotations
 
@@ -8,21 +8,10 @@ import numpy as np
 
 from artemis_drivers.virtual.building import fitted_panel
 from artemis_drivers.virtual.mesh_builder import F64, Colour, MeshBuilder, Shape
-from artemis_drivers.virtual.shapes import box, cylinder, ellipsoid, loft, pose
+from artemis_drivers.virtual.shapes import box, cylinder, ellipsoid, loft, merged, pose
 from artemis_drivers.virtual.textures import PLATES
 
 Rng = np.random.Generator
-_PAINTS: tuple[Colour, ...] = (
-    (0.75, 0.08, 0.08),
-    (0.12, 0.2, 0.5),
-    (0.85, 0.85, 0.87),
-    (0.12, 0.12, 0.13),
-    (0.5, 0.52, 0.55),
-    (0.1, 0.35, 0.2),
-    (0.85, 0.65, 0.1),
-    (0.35, 0.2, 0.12),
-    (0.6, 0.75, 0.85),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +39,36 @@ def add_car(builder: MeshBuilder, rng: Rng, T_world_car: F64) -> None:
     kind = _KINDS[rng.integers(len(_KINDS))]
     scale = rng.uniform(0.96, 1.04)
     T = T_world_car @ pose(-kind.length * scale / 2) @ np.diag([scale, scale, scale, 1.0])
-    paint = _PAINTS[rng.integers(len(_PAINTS))]
+    paint = _paint(rng)
     builder.begin("car")
     builder.add(_body(kind), "car_paint", paint, T)
-    builder.add(_cabin(kind), ("car_paint", "glass"), paint, T)
+    builder.add(_cabin(kind), ("car_paint", "pane"), paint, T)
+    _add_seats(builder, rng, kind, T)
     _add_wheels(builder, kind, T)
     _add_details(builder, rng, kind, paint, T)
+
+
+def _paint(rng: Rng) -> Colour:
+    """Half of all cars are white, grey or black, the others have any colour."""
+    if rng.random() < 0.5:
+        grey = float(rng.choice([0.12, 0.3, 0.5, 0.68, 0.9]) * rng.uniform(0.85, 1.1))
+        return (grey, grey, 1.03 * grey)
+    r, g, b = rng.uniform(0.06, 0.95, 3)
+    return (float(r), float(g), float(b))
+
+
+def _add_seats(builder: MeshBuilder, rng: Rng, kind: _Kind, T: F64) -> None:
+    """What a beam meets through the windows: two front seats with headrests and a rear bench."""
+    rear, front = kind.cabin[0] * kind.length, kind.cabin[3] * kind.length
+    middle, top = 0.45 * rear + 0.55 * front, kind.roof - 0.22
+    grey = float(rng.uniform(0.15, 0.5))
+    half = 0.78 * kind.width / 2
+    seats = [box((rear + 0.55, -half, kind.belt - 0.3), (rear + 0.72, half, top - 0.12))]
+    for side in (-0.5, 0.5):
+        y = side * half
+        seats.append(box((middle - 0.1, y - 0.22, kind.belt - 0.3), (middle + 0.05, y + 0.22, top - 0.12)))
+        seats.append(box((middle - 0.08, y - 0.12, top - 0.14), (middle + 0.02, y + 0.12, top + 0.05)))
+    builder.add(merged(seats), "cloth", (grey, grey, grey), T)
 
 
 def _body(kind: _Kind) -> Shape:

@@ -15,18 +15,24 @@ from numpy.typing import NDArray
 from artemis_drivers.virtual import furniture
 from artemis_drivers.virtual.building import add_gate_wall, add_house
 from artemis_drivers.virtual.car import add_car
+from artemis_drivers.virtual.cyclist import add_bicycle
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder, Shape, WorldMesh
+from artemis_drivers.virtual.movers import add_rider, add_traffic, add_walker
+from artemis_drivers.virtual.person import add_backpack, add_person, add_sitting_person
 from artemis_drivers.virtual.shapes import pose, solid
 from artemis_drivers.virtual.textures import TextureAtlas, build_atlas
-from artemis_drivers.virtual.world import World
+from artemis_drivers.virtual.tree import add_hedge, add_tree
+from artemis_drivers.virtual.world import Mover, World
 
 Rng = np.random.Generator
 BLOCK_M = 40.0
 STATION_M = 1.0  # spacing of the ground's cross sections
 KERB_M = 0.12  # height of the kerb
+_PARKING_M = 2.1
 EYE_M = 1.45  # height at which the rig is held
 INSTANCES_PER_BLOCK = 4096
 HOUSE_DEPTH_M = 9.0
+SLOW_WALK = 0.8  # m/s: for how long the world must keep moving
 END_MARGIN_M = 8.0  # the path keeps this far from the ends of the street
 
 
@@ -97,7 +103,7 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
     layout = _Layout(
         seed=seed,
         length=blocks * BLOCK_M,
-        road=float(rng.uniform(3.9, 4.8)),
+        road=float(rng.uniform(5.0, 5.8)),
         pavement=float(rng.uniform(2.4, 3.4)),
         wave=(float(rng.uniform(0.05, 0.25)), float(rng.uniform(45, 80)), float(rng.uniform(0, 2 * np.pi))),
         tints=tuple(
@@ -118,15 +124,18 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
         path=_path(layout, rng),
         sun=sun,
         atlas=atlas,
+        movers=_movers(layout, atlas, blocks),
     )
 
 
 def _path(layout: _Layout, rng: Rng) -> F64:
-    """The walker keeps near the middle of the road and drifts slowly from side to side."""
+    """The walker keeps to the right half of the road, in part of which cars drive, and drifts from side to side."""
     x = np.arange(END_MARGIN_M, layout.length - END_MARGIN_M, 0.5)
-    free = layout.road - 2.1 - 0.8  # parked cars take 2.1 m
     phase = rng.uniform(0, 2 * np.pi, 2)
-    y = free * (0.6 * np.sin(2 * np.pi * x / 31.0 + phase[0]) + 0.3 * np.sin(2 * np.pi * x / 13.7 + phase[1]))
+    drift = 0.6 * np.sin(2 * np.pi * x / 31.0 + phase[0]) + 0.3 * np.sin(2 * np.pi * x / 13.7 + phase[1])
+    # from beside the parked cars, which take 2.1 m, to beside the driving ones
+    outer, inner = layout.road - _PARKING_M - 0.6, 0.3
+    y = -(outer + inner) / 2 + (outer - inner) / 2 * drift
     return np.column_stack([x, y, layout.level(x) + EYE_M])
 
 
@@ -239,50 +248,98 @@ def _add_parked_cars(builder: MeshBuilder, layout: _Layout, rng: Rng, x0: float,
         x += rng.uniform(5.6, 7.5)
 
 
+_KINDS = (
+    *("tree",) * 3,
+    *("person",) * 2,
+    *("bench",) * 2,
+    *("bollard",) * 2,
+    "lamp",
+    "sign",
+    "bin",
+    "boxes",
+    "cabinet",
+    "bicycle",
+    "planter",
+    "hedge",
+)
+
+
 def _add_furniture(builder: MeshBuilder, layout: _Layout, rng: Rng, x0: float, side: float) -> None:
-    near_kerb = layout.road + 0.55
-    near_house = layout.front - 0.5
-    slots = x0 + 1.2 + np.arange(14) * (BLOCK_M - 2.4) / 13 + rng.uniform(-0.35, 0.35, 14)
-    kinds = [
-        "tree",
-        "lamp",
-        "tree",
-        "sign",
-        "person",
-        "bench",
-        "bin",
-        "tree",
-        "person",
-        "boxes",
-        "bollard",
-        "cabinet",
-        "bollard",
-        "bench",
-    ]
-    for x, kind in zip(slots, rng.permutation(kinds), strict=True):
-        if kind == "tree":
-            furniture.add_tree(builder, rng, _side_pose(layout, x, near_kerb + 0.1, side, rng.uniform(0, 6)))
-        elif kind == "lamp":
-            furniture.add_lamp(builder, rng, _side_pose(layout, x, near_kerb - 0.15, side, -np.pi / 2))
-        elif kind == "sign":
-            T = (
-                _side_pose(layout, x, near_kerb, 1.0)
-                if side > 0
-                else _side_pose(layout, x, near_kerb, -1.0, np.pi)
-            )
-            furniture.add_road_sign(
-                builder, rng, T @ pose(yaw=np.pi if side > 0 and rng.random() < 0.5 else 0.0)
-            )
-        elif kind == "person":
-            y = rng.uniform(near_kerb + 0.4, near_house - 0.2)
-            furniture.add_person(builder, rng, _side_pose(layout, x, y, side, rng.uniform(0, 2 * np.pi)))
-        elif kind == "bench":
-            furniture.add_bench(builder, rng, _side_pose(layout, x, near_house + 0.1, side))
-        elif kind == "bin":
-            furniture.add_bin(builder, rng, _side_pose(layout, x, near_kerb + 0.05, side, rng.uniform(0, 6)))
-        elif kind == "boxes":
-            furniture.add_boxes(builder, rng, _side_pose(layout, x, near_house + 0.1, side))
-        elif kind == "bollard":
-            furniture.add_bollard(builder, rng, _side_pose(layout, x, near_kerb - 0.2, side))
-        else:
-            furniture.add_cabinet(builder, rng, _side_pose(layout, x, near_house + 0.2, side))
+    """Things at the kerb and at the houses; a lane of 0.8 m between them is left to walkers."""
+    count = len(_KINDS)
+    slots = x0 + 1.4 + np.arange(count) * (BLOCK_M - 2.8) / (count - 1) + rng.uniform(-0.25, 0.25, count)
+    for x, kind in zip(slots, rng.permutation(_KINDS), strict=True):
+        _add_thing(builder, layout, rng, str(kind), float(x), side)
+
+
+def _add_thing(builder: MeshBuilder, layout: _Layout, rng: Rng, kind: str, x: float, side: float) -> None:
+    kerb, house = layout.road + 0.55, layout.front - 0.5
+    yaw = rng.uniform(0, 2 * np.pi)
+
+    def at(y: float, yaw: float = 0.0) -> F64:
+        return _side_pose(layout, x, y, side, yaw)
+
+    if kind == "tree":
+        add_tree(builder, rng, at(kerb + 0.1, yaw))
+    elif kind == "lamp":
+        furniture.add_lamp(builder, rng, at(kerb - 0.15, -np.pi / 2))
+    elif kind == "sign":
+        # the front looks along the street, either way
+        furniture.add_road_sign(builder, rng, at(kerb, 0.0 if rng.random() < 0.5 else np.pi))
+    elif kind == "person":
+        add_person(builder, rng, at(house + 0.1 if rng.random() < 0.5 else kerb, yaw))
+    elif kind == "bench":
+        _add_bench(builder, rng, at(house + 0.1))
+    elif kind == "bin":
+        furniture.add_bin(builder, rng, at(kerb + 0.05, yaw))
+    elif kind == "boxes":
+        furniture.add_boxes(builder, rng, at(house + 0.1))
+    elif kind == "bollard":
+        furniture.add_bollard(builder, rng, at(kerb - 0.2))
+    elif kind == "bicycle":
+        add_bicycle(builder, rng, at(house + 0.25, rng.normal(0, 0.06)) @ pose(roll=rng.normal(0, 0.05)))
+    elif kind == "planter":
+        furniture.add_planter(builder, rng, at(house))
+    elif kind == "hedge":
+        add_hedge(builder, rng, at(house + 0.2) @ pose(-1.1), 2.2)
+    else:
+        furniture.add_cabinet(builder, rng, at(house + 0.2))
+
+
+def _add_bench(builder: MeshBuilder, rng: Rng, T: F64) -> None:
+    """Bench, often with a person, at times with a backpack that touches both."""
+    furniture.add_bench(builder, rng, T)
+    if rng.random() < 0.5:
+        return
+    facing = -np.pi / 2
+    add_sitting_person(builder, rng, T @ pose(-0.25, 0.02, yaw=facing), furniture.SEAT_M)
+    if rng.random() < 0.5:
+        add_backpack(builder, rng, T @ pose(0.1, -0.02, furniture.SEAT_M, yaw=facing))
+
+
+def _movers(layout: _Layout, atlas: TextureAtlas, blocks: int) -> tuple[Mover, ...]:
+    """Cars and a cyclist in the left lane, walkers on both pavements."""
+    rng = np.random.default_rng([layout.seed, 3])
+    instance = blocks * INSTANCES_PER_BLOCK
+    duration = 2.0 * layout.length / SLOW_WALK + 60.0
+    movers: list[Mover] = []
+
+    def line(y: float, first: float, last: float) -> F64:
+        x = np.linspace(first, last, int(abs(last - first) / 0.5) + 1)
+        return np.column_stack([x, np.full_like(x, y), [layout.ground(a, y) for a in x]])
+
+    middle = layout.road - _PARKING_M - 1.25  # of the lane of those who come towards the walker
+    for _ in range(2):
+        instance += 1
+        way = line(middle, layout.length - 3.0, 3.0)
+        movers += add_traffic(atlas, rng, instance, way, duration, add_car, rng.uniform(4.0, 8.0))
+    instance += 2
+    movers += add_rider(atlas, rng, instance, line(middle - 0.4, layout.length - 6.0, 6.0), duration)
+    for k in range(2 * blocks):
+        instance += 1
+        side = 1.0 if k % 2 else -1.0
+        y = side * (layout.road + 0.55 + rng.uniform(0.75, layout.pavement - 1.9 + 0.8))
+        start = (k // 2 + rng.random()) * BLOCK_M
+        way = line(y, 4.0, layout.length - 4.0)
+        movers += add_walker(atlas, rng, instance, way, duration, start)
+    return tuple(movers)
