@@ -1,0 +1,1 @@
+"""Livox Avia (SDK 1 protocol): wire format, decoding, session, driver."""

@@ -1,0 +1,275 @@
+"""Data packets of Livox SDK 1 (data types 2 to 8) decoded into slots, compiled.
+
+Header of 18 bytes: version 5, slot, id, reserved, u32 status, u8 timestamp type, u8 data type, 8 bytes of
+time; then points. Layouts from livox_def.h of Livox SDK v2.3.0; millimetres and hundredths of a degree become
+metres. Point i was fired by laser (shot mod 6) at the packet's time + shot x 4.1667 us.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from artemis_drivers._jit import njit
+from artemis_drivers.livox_slots import (
+    CLOCK_GPS,
+    CLOCK_NONE,
+    CLOCK_PPS,
+    CLOCK_PTP,
+    DUPLICATE,
+    IMU_SLOT,
+    POINT_SLOT,
+    STANDARD_GRAVITY,
+    TRACK,
+    ImuArrays,
+    PointArrays,
+    days_of,
+    imu_arrays,
+    point_arrays,
+    track,
+    unwrapped_second,
+)
+from artemis_drivers.ring import Ring
+
+VERSION = 5
+HEADER_BYTES = 18
+SHOT_NS = 1e9 / 240_000
+LINES = 6
+IMU_TYPE = 6
+IMU_PERIOD_NS = 5_000_000
+
+# per data type 0..8: shots a packet, returns a shot, bytes a shot (0: not known here); 3, 5, 8 are spherical
+SHOTS = np.array([0, 0, 96, 96, 48, 48, 1, 30, 30], np.int64)
+RETURNS = np.array([0, 0, 1, 1, 2, 2, 1, 3, 3], np.int64)
+SHOT_BYTES = np.array([0, 0, 14, 10, 28, 16, 24, 42, 22], np.int64)
+_SPHERICAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1], np.int64)
+
+BAD = np.dtype([("version", "i8"), ("type", "i8"), ("length", "i8"), ("time", "i8")])
+"""Packets refused: unknown header version, unknown data type, wrong length for its type, impossible date."""
+POINTS, IMU = 0, 1  # rows of the two streams' TRACK
+
+
+class Decoder:
+    """Decodes the raw packets of one device into a ring of points and a ring of IMU samples."""
+
+    def __init__(self, packets: Ring, *, point_slots: int = 8192, imu_slots: int = 2048) -> None:
+        self.packets = packets
+        self.points = Ring(POINT_SLOT, point_slots)
+        self.imu = Ring(IMU_SLOT, imu_slots)
+        self.tracks = np.zeros(2, TRACK)
+        self.bad = np.zeros(1, BAD)
+        self.last = np.zeros(1, LAST)
+        self._anchor = np.zeros(3, np.int64)
+        self._raw = RawArrays(*packets.field.values())
+        self._points, self._imu = point_arrays(self.points), imu_arrays(self.imu)
+
+    def decode(self, first: int, count: int) -> None:
+        """Decode raw packets ``first .. first + count - 1`` and publish what they hold."""
+        step = min(self.points.slots, self.imu.slots)
+        for start in range(first, first + count, step):
+            n = min(step, first + count - start)
+            at = (self.points.claim(n), self.imu.claim(n))
+            made = decode_packets(
+                self._raw,
+                start,
+                n,
+                self._points,
+                at[0],
+                self._imu,
+                at[1],
+                self.tracks,
+                self.bad,
+                self.last,
+                self._anchor,
+            )
+            self.points.publish(made[0])
+            self.imu.publish(made[1])
+
+    def counters(self) -> dict[str, int]:
+        """Losses of both streams by name, and packets that could not be understood."""
+        names = ("packets", "lost", "gaps", "late", "duplicates", "clock_steps", "clock_changes")
+        found = {
+            f"{stream}_{name}": int(self.tracks[row][name])
+            for row, stream in ((POINTS, "points"), (IMU, "imu"))
+            for name in names
+        }
+        return found | {f"bad_{name}": int(self.bad[0][name]) for name in BAD.names or ()}
+
+
+class RawArrays(NamedTuple):
+    """Fields of a packet ring, for kernels."""
+
+    rx_ns: NDArray[np.int64]
+    size: NDArray[np.int32]
+    data: NDArray[np.uint8]
+
+
+LAST = np.dtype([("status", "u4"), ("clock", "u1"), ("data_type", "u1")])
+"""Status code, timestamp type and point data type of the latest packets."""
+
+
+@njit
+def _u16(b: NDArray[np.uint8], at: int) -> int:
+    value: int = int(b[at]) | int(b[at + 1]) << 8
+    return value
+
+
+@njit
+def _u32(b: NDArray[np.uint8], at: int) -> int:
+    value: int = int(b[at]) | int(b[at + 1]) << 8 | int(b[at + 2]) << 16 | int(b[at + 3]) << 24
+    return value
+
+
+@njit
+def _i32(b: NDArray[np.uint8], at: int) -> int:
+    return int(np.int32(_u32(b, at)))
+
+
+@njit
+def packet_time(b: NDArray[np.uint8], rx: int, anchor: NDArray[np.int64]) -> int:
+    """Device time of a packet in ns by its timestamp type; -1 when it is none.
+
+    Types 0 and 1: as sent; 3 (GPS): since 1970; 4 (time since the pulse): seconds counted on with the host's
+    clock, beginning with 0. ``anchor`` (3,) remembers the last of type 4.
+    """
+    kind = b[8]
+    if kind == CLOCK_GPS:
+        days = days_of(2000 + int(b[10]), int(b[11]), int(b[12]))
+        microseconds = _u32(b, 14)
+        if days < 0 or b[13] > 23 or microseconds >= 3_600_000_000:
+            return -1
+        since_1970: int = ((days * 24 + int(b[13])) * 3_600_000_000 + microseconds) * 1000
+        return since_1970
+    time: int = _u32(b, 10) | _u32(b, 14) << 32
+    if time < 0 or kind not in (CLOCK_NONE, CLOCK_PTP, CLOCK_PPS):
+        return -1
+    if kind == CLOCK_PPS:
+        if time > 1 << 62:
+            return -1
+        if anchor[2]:
+            time = unwrapped_second(time, anchor[0], anchor[1], rx)
+        anchor[0], anchor[1], anchor[2] = time, rx, 1
+    return time
+
+
+@njit
+def _cartesian(
+    b: NDArray[np.uint8], n: int, xyz: NDArray[np.float32], refl: NDArray[np.uint8], tag: NDArray[np.uint8]
+) -> None:
+    """Points of 14 bytes: i32 x, y, z in mm, reflectivity, tag; returns of a shot follow one another."""
+    for i in range(n):
+        at = HEADER_BYTES + 14 * i
+        xyz[i, 0] = _i32(b, at) * 1e-3
+        xyz[i, 1] = _i32(b, at + 4) * 1e-3
+        xyz[i, 2] = _i32(b, at + 8) * 1e-3
+        refl[i], tag[i] = b[at + 12], b[at + 13]
+
+
+@njit
+def _spherical(
+    b: NDArray[np.uint8],
+    shots: int,
+    returns: int,
+    xyz: NDArray[np.float32],
+    refl: NDArray[np.uint8],
+    tag: NDArray[np.uint8],
+) -> None:
+    """Shots of u16 zenith and azimuth in 0.01 degree, and u32 depth in mm, reflectivity, tag for each return.
+
+    With a single return the depth comes before the angles.
+    """
+    unit = np.pi / 18_000
+    for s in range(shots):
+        at = HEADER_BYTES + s * (4 + 6 * returns)
+        angles = at + 4 if returns == 1 else at
+        theta, phi = _u16(b, angles) * unit, _u16(b, angles + 2) * unit
+        x, y, z = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
+        for r in range(returns):
+            i = s * returns + r
+            echo = at if returns == 1 else at + 4 + 6 * r
+            depth = _u32(b, echo) * 1e-3
+            xyz[i, 0], xyz[i, 1], xyz[i, 2] = depth * x, depth * y, depth * z
+            rest = at + 8 if returns == 1 else echo + 4
+            refl[i], tag[i] = b[rest], b[rest + 1]
+
+
+@njit
+def _sound(b: NDArray[np.uint8], size: int, bad: NDArray[np.void]) -> bool:
+    """Whether a packet's version, type and length fit together; counts it when not."""
+    if size < HEADER_BYTES or b[0] != VERSION:
+        bad[0].version += 1
+        return False
+    kind = b[9]
+    if kind >= SHOTS.size or SHOTS[kind] == 0:
+        bad[0].type += 1
+        return False
+    if size != HEADER_BYTES + SHOTS[kind] * SHOT_BYTES[kind]:
+        bad[0].length += 1
+        return False
+    return True
+
+
+@njit
+def decode_packets(
+    raw: RawArrays,
+    first: int,
+    count: int,
+    points: PointArrays,
+    point_at: int,
+    imu: ImuArrays,
+    imu_at: int,
+    tracks: NDArray[np.void],
+    bad: NDArray[np.void],
+    last: NDArray[np.void],
+    anchor: NDArray[np.int64],
+) -> tuple[int, int]:
+    """Raw slots ``first..`` into point slots from ``point_at`` and IMU slots from ``imu_at``; how many of each."""
+    n_points = n_imu = 0
+    for number in range(first, first + count):
+        row = number % raw.size.size
+        b, rx = raw.data[row], raw.rx_ns[row]
+        if not _sound(b, raw.size[row], bad):
+            continue
+        stamp = packet_time(b, rx, anchor)
+        if stamp < 0:
+            bad[0].time += 1
+            continue
+        kind = int(b[9])
+        stream = IMU if kind == IMU_TYPE else POINTS
+        period = IMU_PERIOD_NS if kind == IMU_TYPE else int(SHOTS[kind] * SHOT_NS)
+        if track(tracks, stream, stamp, int(b[8]), rx, period) == DUPLICATE:
+            continue
+        last[0].status, last[0].clock = _u32(b, 4), b[8]
+        if kind == IMU_TYPE:
+            _put_imu(b, stamp, rx, number, imu, (imu_at + n_imu) % imu.stamp_ns.size)
+            n_imu += 1
+        else:
+            last[0].data_type = kind
+            _put_points(b, stamp, rx, number, points, (point_at + n_points) % points.stamp_ns.size)
+            n_points += 1
+    return n_points, n_imu
+
+
+@njit
+def _put_points(b: NDArray[np.uint8], stamp: int, rx: int, number: int, p: PointArrays, at: int) -> None:
+    kind = int(b[9])
+    shots, returns = SHOTS[kind], RETURNS[kind]
+    p.stamp_ns[at], p.rx_ns[at], p.packet[at] = stamp, rx, number
+    p.shot_ns[at], p.status[at] = SHOT_NS, _u32(b, 4)
+    p.filled[at], p.returns[at], p.lines[at] = shots * returns, returns, LINES
+    p.data_type[at], p.clock[at] = kind, b[8]
+    if _SPHERICAL[kind]:
+        _spherical(b, shots, returns, p.xyz[at], p.reflectivity[at], p.tag[at])
+    else:
+        _cartesian(b, shots * returns, p.xyz[at], p.reflectivity[at], p.tag[at])
+
+
+@njit
+def _put_imu(b: NDArray[np.uint8], stamp: int, rx: int, number: int, imu: ImuArrays, at: int) -> None:
+    values = b[HEADER_BYTES : HEADER_BYTES + 24].view(np.float32)
+    imu.stamp_ns[at], imu.rx_ns[at], imu.packet[at], imu.clock[at] = stamp, rx, number, b[8]
+    for k in range(3):
+        imu.gyro[at, k] = values[k]
+        imu.accel[at, k] = values[3 + k] * STANDARD_GRAVITY

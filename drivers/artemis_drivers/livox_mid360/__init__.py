@@ -1,0 +1,1 @@
+"""Livox Mid-360 (SDK 2 protocol): wire format, decoding, session, driver."""
