@@ -121,7 +121,9 @@ def choose_odometry(source: FrameSource, request: Request, span: range) -> Calla
     if request.poses is not None:
         given = lidar_poses(source, read_tum(request.poses))
         poses = pose_per_frame(given, source.stamp_ns, span.start, span.stop, str(request.poses))
-        return lambda: GivenPoses(poses)
+        # more poses than frames also tell how the sensor moved within a scan
+        chosen = given if len(given) > len(source.stamp_ns) else poses
+        return lambda: GivenPoses(chosen)
     if source.poses is not None and len(source.poses) and not request.own_odometry:
         own = source.poses
         return lambda: GivenPoses(own)

@@ -7,17 +7,22 @@ import numpy as np
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.odometry import se3
-from artemis_edge.odometry.deskew import deskew_frame
+from artemis_edge.odometry.deskew import deskew_frame, window
+from artemis_edge.odometry.scan_motion import ScanMotion, covers, during, steady, through, times, turning
+from artemis_edge.trajectory import interpolate
 
 # Stamps this close belong together (the tolerance of ``evaluate trajectory``): printed times are rounded.
 _PAIRING_NS = 10_000_000
+# Poses in a scan, for each piece of its motion, from which on they tell it better than anything between them
+_DENSE = 0.5
 
 
 class GivenPoses:
     """Odometry that looks poses up: exactly at a pose's stamp, between two poses by constant velocity.
 
-    The twist that corrects the motion within a scan is the central difference over the neighbouring poses;
-    with a single pose it is zero. Raises InputError if the poses are unordered or do not cover a frame.
+    The motion within a scan follows the poses themselves where they are denser than the scans, else the
+    gyroscope between them, else the twist and its change between the neighbouring poses; with a single pose it
+    is none. Raises InputError if the poses are unordered or do not cover a frame.
     """
 
     def __init__(self, trajectory: Trajectory) -> None:
@@ -37,8 +42,22 @@ class GivenPoses:
     def track(self, frame: SyncedFrame) -> TrackedFrame:
         """Pose at the frame's stamp and the points moved there; InputError if no pose covers it."""
         T_world_lidar, twist = self.at(frame.stamp_ns)
-        scans = deskew_frame(frame, twist)
+        motion = self._during(frame, T_world_lidar, twist)
+        scans = deskew_frame(frame, motion)
         return TrackedFrame(frame.index, frame.stamp_ns, T_world_lidar, scans, images=frame.images)
+
+    def _during(self, frame: SyncedFrame, T_world_lidar: F64, twist: F64) -> ScanMotion:
+        first_s, last_s = window(frame)
+        ends = times(first_s, last_s)
+        stamps = frame.stamp_ns + np.rint(ends * 1e9).astype(np.int64)
+        inside = np.searchsorted(self._stamps, stamps[-1]) - np.searchsorted(self._stamps, stamps[0])
+        if inside >= _DENSE * len(ends):
+            T = interpolate(Trajectory(self._stamps, self._poses), stamps)
+            return through(ends, se3.inverse(T_world_lidar) @ T)
+        if covers(frame.imu, int(stamps[0]), int(stamps[-1])):
+            near = during(frame.imu, int(stamps[0]), int(stamps[-1]))
+            return turning(near, frame.stamp_ns, twist[:3], ends)
+        return steady(twist)
 
     def at(self, stamp_ns: int) -> tuple[F64, F64]:
         """``T_world_lidar`` (4, 4) and the body twist (6,) (m/s, rad/s) at a stamp."""

@@ -17,10 +17,11 @@ from artemis_edge.frames import F64, ImuSamples, SyncedFrame, TrackedFrame
 from artemis_edge.odometry import imu as inertial
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.aligner import Aligner
-from artemis_edge.odometry.deskew import deskew_frame
+from artemis_edge.odometry.deskew import deskew_frame, window
 from artemis_edge.odometry.motion import Motion, Prediction
 from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import DEGENERATE, Registration
+from artemis_edge.odometry.scan_motion import ScanMotion, covers, during, steady, times, turning
 from artemis_edge.odometry.thin import Thinner, ThinScan, TimedPoints
 
 _START_FRAMES = 2  # what it takes to know a velocity
@@ -165,9 +166,22 @@ class LidarOdometry:
 
     def _tracked(self, frame: SyncedFrame, degenerate: bool = False) -> TrackedFrame:
         """The frame with the pose that the present motion has at its stamp."""
-        T = np.eye(4) if self._motion is None else self._motion.pose_at(frame.stamp_ns)
-        scans = deskew_frame(frame, self.twist)
+        known = self._motion or Motion(np.eye(4), frame.stamp_ns, np.zeros(6))
+        since_s = (frame.stamp_ns - known.stamp_ns) * 1e-9
+        moved = self._during(frame, known, since_s)
+        scans = deskew_frame(frame, moved.referred_to(since_s))
+        T = known.T_world_lidar @ moved.at(since_s)
         return TrackedFrame(frame.index, frame.stamp_ns, T, scans, degenerate, frame.images)
+
+    @staticmethod
+    def _during(frame: SyncedFrame, known: Motion, since_s: float) -> ScanMotion:
+        """Motion relative to the last registered scan: turns by the gyroscope where it covers the frame."""
+        first_s, last_s = window(frame)
+        ends = times(min(first_s + since_s, 0.0), max(last_s + since_s, 0.0))
+        first_ns, last_ns = (known.stamp_ns + round(t * 1e9) for t in (ends[0], ends[-1]))
+        if not covers(frame.imu, first_ns, last_ns):
+            return steady(known.twist)
+        return turning(during(frame.imu, first_ns, last_ns), known.stamp_ns, known.twist[:3], ends)
 
     def _count(self, reason: str, number: int = 1) -> None:
         self.lost[reason] = self.lost.get(reason, 0) + number

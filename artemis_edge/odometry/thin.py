@@ -11,6 +11,7 @@ from artemis_edge.config import OdometryConfig
 from artemis_edge.frames import F32, F64, I64, LidarScan, SyncedFrame
 from artemis_edge.odometry.deskew import move_points
 from artemis_edge.odometry.plane_map import EMPTY, empty_hash, probe
+from artemis_edge.odometry.scan_motion import steady
 
 _BITS = 21  # +-2^20 cells an axis
 _TRIES = 4  # sizes tried for a frame; the next frame goes on from the last
@@ -25,7 +26,7 @@ class TimedPoints(NamedTuple):
 
     def at_one_time(self, twist: F64) -> F32:
         """The points moved to one time by a body twist (6,)."""
-        return np.asarray(move_points(self.points, self.time_s, 0.0, twist, np.eye(4)), np.float32)
+        return np.asarray(move_points(self.points, self.time_s, 0.0, steady(twist), np.eye(4)), np.float32)
 
     def take(self, rows: I64) -> TimedPoints:
         """Some of the points."""
