@@ -1,0 +1,204 @@
+"""Reads a serial IMU in a thread of its own: opens, configures, reads, and starts over when it is unplugged."""
+
+from __future__ import annotations
+
+import termios
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from artemis_drivers.base import Applied, DriverError, Health, State
+from artemis_drivers.imu_serial.link import Port, open_serial, read_chunk
+from artemis_drivers.imu_serial.mtdata2 import MalformedError
+from artemis_drivers.imu_serial.samples import IMU_SAMPLE, Sample, protocol
+from artemis_drivers.imu_serial.settings import ImuSettings
+from artemis_drivers.imu_serial.stream import FrameSplitter
+from artemis_drivers.ring import Ring
+
+CHUNK_BYTES = 4096
+IMU_CHUNK = np.dtype([("rx_ns", "i8"), ("size", "i4"), ("data", "u1", (CHUNK_BYTES,))])
+"""Bytes as they arrived: ``rx_ns`` is host monotonic time."""
+
+SILENT_S = 0.5  # a running IMU sends hundreds of samples a second
+_RETRY_S = (0.1, 0.2, 0.4, 0.8)  # back-off; the last one holds
+_BATCH_S = 0.004  # time comes from the device, so a few samples may arrive together: fewer wake-ups
+
+
+class SerialImu:
+    """Driver (base.Driver) of one IMU. ``samples`` is a ring of IMU_SAMPLE, ``chunks`` one of IMU_CHUNK."""
+
+    def __init__(
+        self,
+        settings: ImuSettings,
+        samples: Ring,
+        chunks: Ring | None = None,
+        open_port: Callable[[str, int], Port] = open_serial,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        if samples.dtype != IMU_SAMPLE or (chunks is not None and chunks.dtype != IMU_CHUNK):
+            raise ValueError("the rings of a serial IMU hold IMU_SAMPLE and IMU_CHUNK")
+        self.settings = settings
+        self._samples, self._chunks = samples, chunks
+        self._open, self._now = open_port, clock
+        self._protocol = protocol(settings)
+        self._splitter = FrameSplitter(self._protocol.framing)
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._state, self._message = State.STOPPED, ""
+        self._applied: tuple[Applied, ...] = ()
+        self._identity: dict[str, str] = {}
+        self._last_data_ns = 0
+        self._status_word = 0
+        self._counts = {"unplugged": 0, "silent": 0, "malformed_frames": 0, "other_frames": 0}
+
+    def start(self) -> None:
+        """Begin to look for the device; it may be plugged in later."""
+        if self._thread is not None:
+            raise DriverError(f"{self.settings.name} runs already: stop it before starting it again")
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._run, name=self.settings.name, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Close the port and end the thread."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._become(State.STOPPED)
+
+    def health(self) -> tuple[Health, ...]:
+        """One device."""
+        return (
+            Health(
+                self.settings.name,
+                self._state,
+                self._message,
+                self._counters(),
+                self._last_data_ns,
+                dict(self._identity),
+                self._applied,
+                {"status": f"{self._status_word:#010x}"},
+            ),
+        )
+
+    def take(self, chunk: bytes, rx_ns: int) -> int:
+        """Decode bytes that arrived at ``rx_ns`` into the rings; returns the number of samples."""
+        self._keep(chunk, rx_ns)
+        return self._publish(self._splitter.feed(chunk), rx_ns)
+
+    def _run(self) -> None:
+        failures = 0
+        while not self._stop.is_set():
+            try:
+                port = self._connect()
+            except (DriverError, OSError, termios.error) as fault:
+                self._become(State.SEARCHING, str(fault))
+                self._stop.wait(_RETRY_S[min(failures, len(_RETRY_S) - 1)])
+                failures += 1
+                continue
+            failures = 0
+            try:
+                self._read(port)
+            finally:
+                port.close()
+
+    def _connect(self) -> Port:
+        self._become(State.CONNECTING)
+        port = self._open(self.settings.port, self.settings.baud)
+        try:
+            self._become(State.CONFIGURING)
+            self._applied = self._protocol.configure(port)
+        except BaseException:
+            port.close()
+            raise
+        self._identity = {item.item: item.read_back for item in self._applied if item.requested == "any"}
+        self._splitter.abandon()
+        refused = [item.item for item in self._applied if item.status == "refused"]
+        self._become(State.RUNNING, f"{self.settings.name} refuses: {', '.join(refused)}" if refused else "")
+        return port
+
+    def _read(self, port: Port) -> None:
+        """Until the device is gone or has been silent for too long."""
+        heard = time.monotonic()
+        while not self._stop.wait(_BATCH_S):
+            try:
+                chunk = read_chunk(port)
+            except (OSError, termios.error):
+                self._counts["unplugged"] += 1
+                self._become(State.SEARCHING, f"{self.settings.name} was unplugged: plug it in again")
+                return
+            if chunk:
+                heard = time.monotonic()
+                self.take(chunk, self._now())
+            elif time.monotonic() - heard > SILENT_S:
+                self._counts["silent"] += 1
+                self._become(State.SILENT, f"{self.settings.name} sends nothing: check its cable and power")
+                return
+            elif held := self._splitter.abandon():
+                self._publish(held, self._now())
+
+    def _keep(self, chunk: bytes, rx_ns: int) -> None:
+        if self._chunks is None:
+            return
+        for at in range(0, len(chunk), CHUNK_BYTES):
+            part = np.frombuffer(chunk[at : at + CHUNK_BYTES], np.uint8)
+            row = self._chunks.claim(1) % self._chunks.slots
+            self._chunks.field["rx_ns"][row] = rx_ns
+            self._chunks.field["size"][row] = len(part)
+            self._chunks.field["data"][row, : len(part)] = part
+            self._chunks.publish(1)
+
+    def _publish(self, frames: list[bytes], rx_ns: int) -> int:
+        published = 0
+        for frame in frames:
+            try:
+                sample = self._protocol.sample(frame)
+            except MalformedError:
+                self._counts["malformed_frames"] += 1
+                continue
+            if sample is None:
+                self._counts["other_frames"] += 1
+                continue
+            published += self._append(sample, rx_ns)
+        return published
+
+    def _append(self, sample: Sample, rx_ns: int) -> bool:
+        reading = self._protocol.clock.read(sample.ticks, sample.counter)
+        if reading is None:
+            return False
+        self._last_data_ns, self._status_word = rx_ns, sample.status
+        since = sample.since_sync_in_ns
+        self._samples.append(
+            {
+                "rx_ns": rx_ns,
+                "device_ns": reading.device_ns,
+                "count": reading.count,
+                "lost": min(reading.lost, np.iinfo(np.int32).max),
+                "boot": reading.boot,
+                "gyro": sample.gyro,
+                "accel": sample.accel,
+                "status": sample.status,
+                "sync_in_count": sample.sync_in_count,
+                "sync_in_ns": reading.device_ns - since if 0 <= since <= reading.device_ns else -1,
+            }
+        )
+        return True
+
+    def _counters(self) -> Mapping[str, int]:
+        clock, stream = self._protocol.clock.counts, self._splitter.counts
+        return {
+            "samples": self._samples.published,
+            "lost": clock.lost,
+            "repeated": clock.repeated,
+            "rejected": clock.rejected,
+            "restarts": clock.restarts,
+            "skipped_bytes": stream.skipped_bytes,
+            "bad_checks": stream.bad_checks,
+            **self._counts,
+        }
+
+    def _become(self, state: State, message: str = "") -> None:
+        self._state, self._message = state, message

@@ -1,0 +1,94 @@
+"""Questions and answers on a serial port, while the device may be streaming."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+import serial
+
+from artemis_drivers.base import DriverError
+from artemis_drivers.imu_serial.stream import FrameSplitter, Framing
+
+READ_TIMEOUT_S = 0.05
+_CHUNK = 4096
+
+
+class Port(Protocol):
+    """What is used of serial.Serial."""
+
+    baudrate: int
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that can be read at once."""
+        ...
+
+    def read(self, size: int = 1, /) -> bytes:
+        """Up to ``size`` bytes; fewer, or none, after the port's timeout."""
+        ...
+
+    def write(self, data: bytes, /) -> int | None:
+        """Send."""
+        ...
+
+    def close(self) -> None:
+        """Give the port back."""
+        ...
+
+
+def open_serial(path: str, baud: int) -> Port:
+    """The port for us alone, with the least latency it offers; DriverError if it cannot be opened."""
+    try:
+        port = serial.Serial(path, baud, timeout=READ_TIMEOUT_S, write_timeout=1.0, exclusive=True)
+    except (OSError, ValueError) as fault:
+        raise DriverError(_why_not(path, fault)) from fault
+    # USB converters otherwise hold bytes back for 16 ms; a pseudo terminal has no such mode
+    with contextlib.suppress(OSError, ValueError, NotImplementedError):
+        port.set_low_latency_mode(True)
+    return port  # type: ignore[no-any-return]
+
+
+def read_chunk(port: Port) -> bytes:
+    """What has arrived, waiting up to READ_TIMEOUT_S for the first byte; OSError if the device is gone."""
+    first = port.read(1)
+    return first + port.read(min(port.in_waiting, _CHUNK)) if first else first
+
+
+class Link:
+    """Sends requests and waits for the frame that answers; frames in between are counted and dropped."""
+
+    def __init__(self, port: Port, framing: Framing) -> None:
+        self.port = port
+        self.other_frames = 0
+        self._splitter = FrameSplitter(framing)
+        self._waiting: deque[bytes] = deque()
+
+    def ask(self, request: bytes, answers: Callable[[bytes], bool], timeout_s: float) -> bytes | None:
+        """The first frame for which ``answers`` is true, or None after the time has passed."""
+        self.port.write(request)
+        until = time.monotonic() + timeout_s
+        while True:
+            while self._waiting:
+                frame = self._waiting.popleft()
+                if answers(frame):
+                    return frame
+                self.other_frames += 1
+            if time.monotonic() > until:
+                return None
+            chunk = read_chunk(self.port)
+            self._waiting.extend(self._splitter.feed(chunk) if chunk else self._splitter.abandon())
+
+
+def _why_not(path: str, fault: Exception) -> str:
+    text = str(fault)
+    if isinstance(fault, FileNotFoundError) or "No such file" in text:
+        return f"{path} is not there: plug the IMU in, or correct port"
+    if "Permission denied" in text:
+        return f"{path} may not be opened: add this user to the group dialout, log out and in"
+    if "exclusively lock" in text or "busy" in text:
+        return f"{path} is used by another program: stop that one"
+    return f"{path} cannot be opened: {text}"

@@ -1,0 +1,113 @@
+"""Frames of either protocol become samples in one form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from artemis_drivers.base import Applied
+from artemis_drivers.imu_serial import mtdata2, vectornav
+from artemis_drivers.imu_serial.clock import VECTORNAV_CLOCK, XSENS_CLOCK, DeviceClock
+from artemis_drivers.imu_serial.configure import configure_mti, configure_vectornav
+from artemis_drivers.imu_serial.link import Port
+from artemis_drivers.imu_serial.mtdata2 import MalformedError, Mid, Type
+from artemis_drivers.imu_serial.settings import ImuSettings, MtiSettings, VectorNavSettings
+from artemis_drivers.imu_serial.stream import Framing
+
+IMU_SAMPLE = np.dtype(
+    [
+        ("rx_ns", "i8"),
+        ("device_ns", "i8"),
+        ("count", "i8"),
+        ("lost", "i4"),
+        ("boot", "i4"),
+        ("gyro", "f8", (3,)),
+        ("accel", "f8", (3,)),
+        ("status", "u4"),
+        ("sync_in_count", "i8"),
+        ("sync_in_ns", "i8"),
+    ]
+)
+"""One sample: host time of its chunk, device time, sample number, samples lost just before it, restarts of
+the device; rad/s and m/s2 in the IMU's axes; pulses on its sync input and device time of the last one
+(-1 without)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What a frame says, in device units: ``counter`` and ``ticks`` still wrap."""
+
+    ticks: int
+    counter: int
+    gyro: tuple[float, ...]
+    accel: tuple[float, ...]
+    status: int = 0
+    sync_in_count: int = -1
+    since_sync_in_ns: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """What differs between the makers. ``sample`` gives None for a frame that is no sample, and raises
+    MalformedError for one that ought to be.
+    """
+
+    framing: Framing
+    clock: DeviceClock
+    configure: Callable[[Port], tuple[Applied, ...]]
+    sample: Callable[[bytes], Sample | None]
+
+
+def protocol(settings: ImuSettings) -> Protocol:
+    """The protocol of the configured device."""
+    if isinstance(settings, MtiSettings):
+        mti: MtiSettings = settings
+        clock = DeviceClock(XSENS_CLOCK, mti.rate_hz)
+        return Protocol(mtdata2.XbusFraming(), clock, lambda port: configure_mti(port, mti), mti_sample)
+    vn: VectorNavSettings = settings
+    clock = DeviceClock(VECTORNAV_CLOCK, vn.rate_hz)
+    configure = lambda port: configure_vectornav(port, vn)  # noqa: E731
+    return Protocol(vectornav.VectorNavFraming(), clock, configure, vectornav_sample)
+
+
+def mti_sample(frame: bytes) -> Sample | None:
+    """The sample in an Xbus frame; any precision and coordinate system."""
+    message = mtdata2.decode(frame)
+    if message.mid != Mid.MTDATA2:
+        return None
+    values: dict[int, tuple[Any, ...]] = {}
+    for item in mtdata2.decode_items(message.data):
+        values[item.type] = item.values
+    gyro = values.get(Type.RATE_OF_TURN) or values.get(Type.RATE_OF_TURN_HR)
+    accel = values.get(Type.ACCELERATION) or values.get(Type.ACCELERATION_HR)
+    if gyro is None or accel is None:
+        return None  # a packet of the slower outputs
+    try:
+        ticks, counter = values[Type.SAMPLE_TIME_FINE][0], values[Type.PACKET_COUNTER][0]
+    except KeyError as missing:
+        raise MalformedError("a sample without counter or time") from missing
+    return Sample(ticks, counter, gyro, accel, values.get(Type.STATUS_WORD, (0,))[0])
+
+
+def vectornav_sample(frame: bytes) -> Sample | None:
+    """The sample in a VectorNav binary message that holds the fields we configure."""
+    if frame[0] != vectornav.SYNC:
+        return None
+    fields: dict[str, tuple[Any, ...]] = vectornav.decode(frame).fields
+    gyro, accel = fields.get("common.angular_rate"), fields.get("common.acceleration")
+    if gyro is None or accel is None:
+        return None
+    if "common.time_startup_ns" not in fields:
+        raise MalformedError("a sample without its time")
+    return Sample(
+        fields["common.time_startup_ns"][0],
+        0,
+        gyro,
+        accel,
+        0,
+        fields.get("common.sync_in_count", (-1,))[0],
+        fields.get("common.time_sync_in_ns", (-1,))[0],
+    )
