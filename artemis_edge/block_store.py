@@ -24,7 +24,7 @@ VOXELS_PER_BLOCK = 8
 EMPTY_KEY = -(2**63) + 1
 
 # Columns of Store.evidence: sums over the points of a cell, relative to the cell's centre [m]
-COUNT, SUM, SQUARE, VIEW, THROUGH, CONFIRMED = 0, 1, 4, 10, 13, 14
+COUNT, SUM, SQUARE, VIEW, THROUGH, CONFIRMED, HITS = 0, 1, 4, 10, 13, 14, 15
 # Columns of Store.vertex
 POSITION, NORMAL, ROUGHNESS = 0, 3, 6
 # Columns of Store.voxel
@@ -91,9 +91,9 @@ def allocate(budget_bytes: float) -> Store:
         voxel=np.empty((voxels, 12), np.int32),
         voxel_mask=np.empty(voxels, np.uint64),
         voxel_cell=np.empty((voxels, 64), np.int32),
-        evidence=np.empty((cells, 16), np.float32),
-        vertex=np.empty((cells, 8), np.float32),
-        state=np.empty(cells, np.uint8),
+        evidence=np.zeros((cells, 16), np.float32),
+        vertex=np.zeros((cells, 8), np.float32),
+        state=np.zeros(cells, np.uint8),
         triangle=np.empty((triangles, 3), np.uint16),
         queue=np.empty(voxels, np.int32),
         counter=np.zeros(12, np.int64),
@@ -176,15 +176,12 @@ def add_voxel(store: Store, block: int, inner: int, x: int, y: int, z: int) -> i
 
 @kernel
 def add_cell(store: Store, v: int, c: int) -> int:
-    """A fresh cell ``c`` of voxel ``v`` without evidence; -1 when the pool is full."""
+    """A fresh cell ``c`` of voxel ``v``; -1 when the pool is full. What is free in the pool is all zeros."""
     s = _take(store.counter, store.free_cell, FREE_CELLS, N_CELLS, store.evidence.shape[0])
     if s < 0:
         return -1
     store.voxel_cell[v, c] = s
     store.voxel_mask[v] |= np.uint64(1) << np.uint64(c)
-    store.evidence[s, :] = 0.0
-    store.vertex[s, :] = 0.0
-    store.state[s] = EVIDENCE_ONLY
     return s
 
 
@@ -302,6 +299,9 @@ def remove_block(store: Store, block: int) -> None:
         for c in range(64):
             s = store.voxel_cell[v, c]
             if s >= 0:
+                store.evidence[s, :] = 0.0
+                store.vertex[s, :] = 0.0
+                store.state[s] = EVIDENCE_ONLY
                 store.free_cell[store.counter[FREE_CELLS]] = s
                 store.counter[FREE_CELLS] += 1
         store.free_voxel[store.counter[FREE_VOXELS]] = v

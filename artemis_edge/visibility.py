@@ -22,6 +22,7 @@ from artemis_edge.block_store import (
     CONFIRMED,
     COUNT,
     FRESH,
+    HITS,
     IX,
     IY,
     IZ,
@@ -206,6 +207,7 @@ def _carve_block(
                 if is_seen_through(e):
                     gone_here += store.state[s] == ALIVE
                     store.state[s] = CARVED
+                    e[HITS] = 0.0
                     for k in range(COUNT, THROUGH):
                         e[k] = 0.0
                     gone += 1

@@ -25,15 +25,11 @@ from artemis_edge.block_store import (
     IY,
     IZ,
     NORMAL,
-    PENDING,
     POSITION,
-    REFUSED_POINTS,
     ROUGHNESS,
-    SEEN,
     SQUARE,
     SUM,
     THROUGH,
-    TOUCHED,
     TOUCHED_BLOCKS,
     VIEW,
     Store,
@@ -42,10 +38,8 @@ from artemis_edge.cell_code import CODES, gather_cells
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.eigen3 import smallest_eigen3
 from artemis_edge.frames import F32, F64, I32, U8, TrackedFrame
+from artemis_edge.insertion import InsertRules, insert_points, new_chunk
 
-POOL_FULL = -1
-# A cell with this much evidence no longer asks for re-meshing: its mean moves by less than sigma / 8
-SETTLED_COUNT = 64.0
 # A plane may be this much thicker than sigma^2: the noise of the angles adds to that of the range
 THICK = 1.0
 # Fewer hits lie on some plane by chance: three always do
@@ -55,8 +49,6 @@ TRUSTED_COUNT = 6.0
 STAYS = 0.7
 # FRESH of a voxel whose patch must be made anew whatever else it waits for: a vertex it uses is gone
 AT_ONCE = 64
-# Moments stop growing here, far below where float32 sums lose digits
-SATURATED_COUNT = 1000.0
 
 
 class VoxelMap:
@@ -71,6 +63,10 @@ class VoxelMap:
         self.block_m = config.voxel_m * bs.VOXELS_PER_BLOCK
         self.store = bs.allocate(budget_bytes)
         self._touched = np.empty(self.store.voxel.shape[0], np.int32)
+        self._insert_rules = InsertRules(
+            self.cell_m, config.min_range_m, config.max_range_m, config.noise_range_m
+        )
+        self._chunk = new_chunk()
 
     def insert(self, frame: TrackedFrame, stamp: int) -> I32:
         """Allocate the points of a frame; returns the slots of the voxels that received points.
@@ -85,110 +81,17 @@ class VoxelMap:
                 scan.points,
                 frame.T_world_lidar,
                 scan.origin,
-                self.cell_m,
-                self.config.min_range_m,
-                self.config.max_range_m,
-                self.config.noise_range_m,
+                self._insert_rules,
                 stamp,
                 self._touched,
                 n,
+                self._chunk,
             )
         return self._touched[:n].copy()
 
     def touched_blocks(self) -> I32:
         """Slots of the blocks that received points in the last frame."""
         return self.store.touched_block[: self.store.counter[TOUCHED_BLOCKS]]
-
-
-@kernel
-def insert_points(
-    store: Store,
-    points: F32,
-    T_world_lidar: F64,
-    origin: F64,
-    cell_m: float,
-    min_range_m: float,
-    max_range_m: float,
-    noise_range_m: float,
-    stamp: int,
-    touched: I32,
-    n: int,
-) -> int:
-    """Add points (n, 3) in the lidar frame to their cells; ``touched`` gets voxels first seen at ``stamp``.
-
-    A point weighs 1 / (1 + (range / noise_range)^2): the inverse variance of a LiDAR whose error is a constant
-    in range plus a constant in angle, relative to its variance at close range. Returns the length of
-    ``touched``; points that find the pool full are left out (the caller makes room and is told by the counters).
-    """
-    R, t = T_world_lidar[:3, :3], T_world_lidar[:3, 3]
-    evidence, voxel, voxel_cell = store.evidence, store.voxel, store.voxel_cell
-    inverse = 1.0 / cell_m
-    last_x, last_y, last_z, v = -(2**40), 0, 0, -1
-    for i in range(points.shape[0]):
-        ax, ay, az = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        ex, ey, ez = origin[0] - ax, origin[1] - ay, origin[2] - az
-        range_m = math.sqrt(ex * ex + ey * ey + ez * ez)
-        if not (range_m >= min_range_m and range_m <= max_range_m):  # NaN fails both
-            continue
-        px = R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az + t[0]
-        py = R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az + t[1]
-        pz = R[2, 0] * ax + R[2, 1] * ay + R[2, 2] * az + t[2]
-        cx, cy, cz = math.floor(px * inverse), math.floor(py * inverse), math.floor(pz * inverse)
-        x, y, z = cx >> 2, cy >> 2, cz >> 2
-        if x != last_x or y != last_y or z != last_z:
-            v = _voxel_at(store, x, y, z, stamp)
-            last_x, last_y, last_z = x, y, z
-            if v >= 0 and voxel[v, TOUCHED] != stamp:
-                voxel[v, TOUCHED] = stamp
-                touched[n] = v
-                n += 1
-        if v < 0:
-            store.counter[REFUSED_POINTS] += 1
-            continue
-        c = ((cx & 3) << 4) | ((cy & 3) << 2) | (cz & 3)
-        s = voxel_cell[v, c]
-        if s < 0:
-            s = bs.add_cell(store, v, c)
-            if s < 0:
-                store.counter[REFUSED_POINTS] += 1
-                continue
-            voxel[v, FRESH] += 1
-        e = evidence[s]
-        if e[COUNT] >= SATURATED_COUNT:
-            continue
-        if e[COUNT] < SETTLED_COUNT:
-            voxel[v, PENDING] += 1
-        w = 1.0 / (1.0 + (range_m / noise_range_m) ** 2)
-        dx, dy, dz = px - (cx + 0.5) * cell_m, py - (cy + 0.5) * cell_m, pz - (cz + 0.5) * cell_m
-        e[COUNT] += w
-        e[SUM] += w * dx
-        e[SUM + 1] += w * dy
-        e[SUM + 2] += w * dz
-        e[SQUARE] += w * dx * dx
-        e[SQUARE + 1] += w * dx * dy
-        e[SQUARE + 2] += w * dx * dz
-        e[SQUARE + 3] += w * dy * dy
-        e[SQUARE + 4] += w * dy * dz
-        e[SQUARE + 5] += w * dz * dz
-        s_w = w / max(range_m, 1e-6)
-        e[VIEW] += s_w * (R[0, 0] * ex + R[0, 1] * ey + R[0, 2] * ez)
-        e[VIEW + 1] += s_w * (R[1, 0] * ex + R[1, 1] * ey + R[1, 2] * ez)
-        e[VIEW + 2] += s_w * (R[2, 0] * ex + R[2, 1] * ey + R[2, 2] * ez)
-    return n
-
-
-@kernel
-def _voxel_at(store: Store, x: int, y: int, z: int, stamp: int) -> int:
-    block = bs.find_or_add_block(store, x >> 3, y >> 3, z >> 3)
-    if block < 0:
-        return POOL_FULL
-    if store.block[block, SEEN] != stamp:
-        store.block[block, SEEN] = stamp
-        store.touched_block[store.counter[TOUCHED_BLOCKS]] = block
-        store.counter[TOUCHED_BLOCKS] += 1
-    inner = bs.inner_index(x, y, z)
-    v = store.block_voxel[block, inner]
-    return v if v >= 0 else bs.add_voxel(store, block, inner, x, y, z)
 
 
 class RefreshRules(NamedTuple):

@@ -8,6 +8,7 @@ from artemis_edge import cell_code as cc
 from artemis_edge import voxel_map as vm
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.frames import F32, F64, DeskewedScan, TrackedFrame
+from artemis_edge.insertion import CHUNK, SATURATED_COUNT
 from artemis_edge.voxel_map import VoxelMap
 from tests import naive
 
@@ -76,6 +77,19 @@ def test_insertion_against_a_dictionary(seed: int) -> None:
     _assert_equal(voxel_map, twin)
 
 
+@pytest.mark.parametrize("n", [1, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK])
+def test_scans_around_the_length_of_a_chunk(n: int) -> None:
+    """Every point counts once, and the points out of range between them not at all."""
+    points = np.random.default_rng(n).uniform(-4.0, 4.0, (n, 3)).astype(np.float32)
+    points[1::7] = np.nan
+    scan = DeskewedScan(points, np.array([0.0, 0.0, 9.0]))
+    voxel_map = VoxelMap(CONFIG, 1.0)
+    for stamp in (1, 2):  # the second scan finds everything there
+        voxel_map.insert(TrackedFrame(0, 0, np.eye(4), (scan,)), stamp)
+    _assert_equal(voxel_map, {cell: 2.0 * row for cell, row in _naive(scan, np.eye(4)).items()})
+    assert voxel_map.store.evidence[:, bs.HITS].sum() == 2 * np.isfinite(points[:, 0]).sum()
+
+
 def test_two_scans_of_one_frame_touch_a_voxel_once() -> None:
     voxel_map = VoxelMap(CONFIG, 1.0)
     scan = DeskewedScan(np.array([[2.0, 0.1, 0.1], [2.0, 0.1, 0.1]], np.float32), np.zeros(3))
@@ -131,7 +145,7 @@ def test_evidence_of_a_cell_stops_growing() -> None:
     points = np.tile([2.0, 0.05, 0.05], (3000, 1))
     voxel_map.insert(naive.frame_of(points), 1)
     (row,) = _cells(voxel_map).values()
-    assert vm.SATURATED_COUNT <= row[0] <= vm.SATURATED_COUNT + 1
+    assert SATURATED_COUNT <= row[0] <= SATURATED_COUNT + 1
 
 
 def test_full_memory_refuses_points_and_counts_them() -> None:
@@ -238,15 +252,15 @@ def test_degenerate_evidence_gives_finite_vertices(shape: str) -> None:
 
 def test_moments_of_27_cells_against_a_dictionary() -> None:
     rng = np.random.default_rng(5)
-    grid, moment = np.full(cc.CODES, -1, np.int32), rng.normal(size=(216, 13))
+    grid, moment = np.full(cc.CODES, -1, np.int32), rng.normal(size=(216, 16))
     cells: dict[naive.Cell, F64] = {}
     for i, c in enumerate({tuple(rng.integers(11, 17, 3).tolist()) for _ in range(120)}):
         grid[cc.code_of(*c)] = i
-        cells[c] = moment[i]  # type: ignore[index]
-    total = np.empty(13)
+        cells[c] = moment[i, :13]  # type: ignore[index]
+    total = np.empty(16)
     for x, y, z in cells:
         vm._sum_around(grid, cc.code_of(x, y, z), moment, total)
-        np.testing.assert_allclose(total, naive.sum_around(cells, (x, y, z)))
+        np.testing.assert_allclose(total[:13], naive.sum_around(cells, (x, y, z)))
 
 
 def test_moved_moments_are_those_of_the_points_themselves() -> None:
@@ -255,7 +269,7 @@ def test_moved_moments_are_those_of_the_points_themselves() -> None:
     voxel_map = VoxelMap(CONFIG, 1.0)
     points = rng.uniform(0.0, CONFIG.voxel_m, (400, 3))
     voxel_map.insert(naive.frame_of(points, (3, 0, 0)), 1)
-    store, cell_m, moment = voxel_map.store, voxel_map.cell_m, np.zeros((216, 13))
+    store, cell_m, moment = voxel_map.store, voxel_map.cell_m, np.zeros((216, 16))
     for c in range(64):
         s = int(store.voxel_cell[0, c])
         if s >= 0:
