@@ -22,7 +22,7 @@ from artemis_drivers.virtual.person import add_backpack, add_person, add_sitting
 from artemis_drivers.virtual.shapes import pose, solid
 from artemis_drivers.virtual.textures import TextureAtlas, build_atlas
 from artemis_drivers.virtual.tree import add_hedge, add_tree
-from artemis_drivers.virtual.world import Mover, World
+from artemis_drivers.virtual.world import Mover, World, random_sun
 
 Rng = np.random.Generator
 BLOCK_M = 40.0
@@ -111,10 +111,6 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
             for c in ((1, 1, 1), (0.85, 0.82, 0.78), (0.95, 0.95, 0.93), (0.55, 0.54, 0.53))
         ),
     )
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 60))
-    sun = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
     atlas = build_atlas(seed) if atlas is None else atlas
     return World(
         name="street",
@@ -122,7 +118,7 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
         block_edges=np.arange(blocks + 1, dtype=np.float64) * BLOCK_M,
         build_block=lambda k: _block(layout, atlas, k, blocks),
         path=_path(layout, rng),
-        sun=sun,
+        sun=random_sun(rng),
         atlas=atlas,
         movers=_movers(layout, atlas, blocks),
     )
@@ -335,11 +331,11 @@ def _movers(layout: _Layout, atlas: TextureAtlas, blocks: int) -> tuple[Mover, .
         movers += add_traffic(atlas, rng, instance, way, duration, add_car, rng.uniform(4.0, 8.0))
     instance += 2
     movers += add_rider(atlas, rng, instance, line(middle - 0.4, layout.length - 6.0, 6.0), duration)
-    for k in range(2 * blocks):
+    for k in range(blocks + 1):
         instance += 1
         side = 1.0 if k % 2 else -1.0
         y = side * (layout.road + 0.55 + rng.uniform(0.75, layout.pavement - 1.9 + 0.8))
-        start = (k // 2 + rng.random()) * BLOCK_M
+        start = (k + rng.random()) * BLOCK_M
         way = line(y, 4.0, layout.length - 4.0)
         movers += add_walker(atlas, rng, instance, way, duration, start)
     return tuple(movers)

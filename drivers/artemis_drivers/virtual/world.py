@@ -65,3 +65,10 @@ class World:
     def mesh(self, blocks: range | None = None) -> WorldMesh:
         """Triangles of the given blocks (all without)."""
         return joined([self.build_block(k) for k in (range(self.block_count) if blocks is None else blocks)])
+
+
+def random_sun(rng: np.random.Generator) -> F64:
+    """Unit vector towards a sun 30 to 65 degrees high."""
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(30, 65))
+    across = np.cos(elevation)
+    return np.array([np.cos(azimuth) * across, np.sin(azimuth) * across, np.sin(elevation)])
