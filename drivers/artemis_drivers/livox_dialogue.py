@@ -14,6 +14,13 @@ ANSWER_TIMEOUT_NS = 500_000_000  # as the official SDK
 MS = 1_000_000
 
 
+class Datagram(NamedTuple):
+    """Something to be sent."""
+
+    data: bytes
+    address: tuple[str, int]
+
+
 class Ask(NamedTuple):
     """A command and its payload; sent again after each ``ANSWER_TIMEOUT_NS``, ``tries`` times in all."""
 
@@ -35,6 +42,7 @@ class Dialogue:
         self._seq = 0
         self._sent = 0
         self._due = 0
+        self._stepping = False
         self.resent = 0
         self.unanswered = 0
 
@@ -51,7 +59,7 @@ class Dialogue:
 
     def cancel(self) -> None:
         """Forget the script."""
-        if self._script is not None:
+        if self._script is not None and not self._stepping:
             self._script.close()
         self._script = self._ask = None
 
@@ -79,16 +87,18 @@ class Dialogue:
         script = self._script
         if script is None:
             return
-        self._ask = None
+        self._ask, self._stepping = None, True
         try:
             wanted = script.send(payload)
         except StopIteration:
             if self._script is script:
                 self._script = None
             return
-        if self._script is not script:  # the step itself cancelled or replaced the script
-            return
-        if isinstance(wanted, Ask):
+        finally:
+            self._stepping = False
+        if self._script is not script:  # the step itself gave up or began another script
+            script.close()
+        elif isinstance(wanted, Ask):
             self._ask, self._seq, self._sent = wanted, self._next_seq(), 0
             self._put(wanted, now)
         else:

@@ -9,28 +9,28 @@ from __future__ import annotations
 
 import ipaddress
 from collections import Counter
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable
 
 from artemis_drivers.base import Applied, State
 from artemis_drivers.livox_avia import payloads
+from artemis_drivers.livox_avia.items import Item, command, items
 from artemis_drivers.livox_avia.protocol import (
     AVIA,
     COMMAND_PORT,
     DEVICE_NAMES,
+    DISCOVERY_PORT,
     Frame,
     General,
     Kind,
     Lidar,
-    Param,
     Ret,
     WorkState,
     decode,
     encode,
 )
-from artemis_drivers.livox_avia.settings import RETURN_MODES, AviaConfig
+from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.livox_avia.status import Status
-from artemis_drivers.livox_dialogue import MS, Ask, Dialogue, Script
+from artemis_drivers.livox_dialogue import MS, Ask, Datagram, Dialogue, Script
 from artemis_drivers.udp import Interface, address_facing, interfaces
 
 HEARTBEAT_NS = 800 * MS
@@ -42,28 +42,7 @@ _INIT_POLL_NS = 50 * MS
 _REFUSALS = 5  # a command is repeated so often before it counts as refused
 _REFUSED_PAUSE_NS = 200 * MS
 _ANSWERS_AGAIN_NS = 1000 * MS
-
-
-class Outgoing(NamedTuple):
-    """A datagram to be sent from the command socket."""
-
-    data: bytes
-    address: tuple[str, int]
-
-
-class Item(NamedTuple):
-    """One thing to configure. ``expected`` are the bytes a correct read-back begins with."""
-
-    name: str
-    requested: str
-    ask: Ask
-    read: Ask | None
-    expected: bytes
-
-
-def command(cmd: General | Lidar) -> int:
-    """Command set and id as one number."""
-    return (isinstance(cmd, Lidar) << 8) | cmd
+_NOT_TAKEN = ("no answer", "error")
 
 
 class AviaSession:
@@ -73,7 +52,7 @@ class AviaSession:
         self.config = config
         self.state = State.STOPPED
         self.message = ""
-        self.outbox: list[Outgoing] = []
+        self.outbox: list[Datagram] = []
         self.counters: Counter[str] = Counter()
         self.applied: dict[str, Applied] = {}
         self.code = ""
@@ -87,7 +66,12 @@ class AviaSession:
         self._seq = 0
         self._utc_seq: set[int] = set()
         self._began = self._heartbeat_sent = self._heard = self._last_data = self._running_since = 0
-        self._connected = False
+        self._in_session = False  # the device has been told where to send
+
+    @property
+    def connected(self) -> bool:
+        """Whether the device is believed to be there (it may be starting up or silent for a moment)."""
+        return self._in_session and self.state != State.SEARCHING
 
     # -- what the host calls ------------------------------------------------------------------------------------
 
@@ -97,32 +81,36 @@ class AviaSession:
 
     def begin_stop(self, now: int) -> None:
         """Stop sampling and take leave; ``state`` is STOPPED when that is done or was not answered."""
-        if self._connected:
+        if self.connected and self.state != State.CONNECTING:
             self._dialogue.start(self._farewell(), now)
         else:
             self.state = State.STOPPED
 
     def wants(self, code: str) -> bool:
         """Whether a broadcast code is this session's device."""
-        mine = self.code or self.config.broadcast_code
+        mine = self._mine()
         return bool(mine) and code.startswith(mine)
+
+    def _mine(self) -> str:
+        """Code of the device sought; empty when any will do."""
+        return self.config.broadcast_code or (self.code if self.state != State.SEARCHING else "")
 
     def hear_broadcast(self, broadcast: payloads.Broadcast, ip: str, now: int) -> bool:
         """A device announced itself; True when it is (now) ours."""
         if self.state == State.STOPPED:
             return False
-        if not self.wants(broadcast.code) and (self.code or self.config.broadcast_code):
-            if not self._connected:
+        if self._mine() and not self.wants(broadcast.code):
+            if not self.connected and now - self._began > UNHEARD_NS:
                 self.message = (
-                    f"Livox {self.config.broadcast_code or self.code} is not heard, but {broadcast.code} at {ip} "
-                    f"is: correct broadcast_code of {self.config.name} or connect the other device"
+                    f"Livox {self._mine()} is not heard, but {broadcast.code} at {ip} is: "
+                    f"correct broadcast_code of {self.config.name} or connect the other device"
                 )
             return False
         if broadcast.device != AVIA:
             name = DEVICE_NAMES.get(broadcast.device, f"type {broadcast.device}")
             self.message = f"Livox {name} {broadcast.code} at {ip} is not an Avia: connect an Avia"
             return False
-        if not self._connected or self._forgotten(now):
+        if self.state != State.CONNECTING and (not self._in_session or self._forgotten(now)):
             self._connect(broadcast.code, ip, now)
         return True
 
@@ -142,12 +130,12 @@ class AviaSession:
         self.status_code = status_code
         if self.state == State.SILENT:
             self.state, self.message = State.RUNNING, self._advice()
-        if data_type and self.state == State.RUNNING and self.applied["coordinate"].status == "unreadable":
-            self._coordinate_seen(data_type)
+        if data_type and self.state == State.RUNNING:
+            self._seen("coordinate", "spherical" if data_type in (3, 5, 8) else "cartesian")
 
     def send_utc(self, unix_ns: int) -> None:
         """Name the PPS edge just passed (10 to 500 ms ago, Avia user manual)."""
-        if not self._connected:
+        if not self.connected:
             self.counters["utc_not_connected"] += 1
             return
         self._utc_seq = {self._put(Lidar.UTC, payloads.encode_utc(unix_ns))}
@@ -156,39 +144,42 @@ class AviaSession:
     def tick(self, now: int) -> None:
         """Whatever is due by the clock."""
         self._dialogue.tick(now)
-        if self.state == State.STOPPED:
+        if self.state == State.STOPPED or self.state == State.CONNECTING:
             return
-        if not self._connected:
-            if now - self._began > UNHEARD_NS and not self.message:
-                self.message = (
-                    f"no Livox Avia is heard on UDP port 55000 for {(now - self._began) // 10**9} s: check its power, "
-                    "its cable and that no firewall blocks the port"
-                )
-            return
-        if self.state == State.CONNECTING:
-            return
-        if now - self._heartbeat_sent >= HEARTBEAT_NS:
-            self._heartbeat_sent = now
-            self._put(General.HEARTBEAT)
-            self.counters["heartbeats"] += 1
-        if now - self._heard > LOST_NS:
-            self._search(
-                f"the Livox Avia {self.code} does not answer any more: check its power and cable", now
+        if self._in_session:
+            self._beat(now)
+        if self.state == State.SEARCHING and not self.message and now - self._began > UNHEARD_NS:
+            self.message = (
+                f"no Livox Avia is heard on UDP port {DISCOVERY_PORT}: check its power, its cable, and that no "
+                "firewall blocks the port"
             )
-        elif self.state in (State.RUNNING, State.SILENT):
+        if self.state in (State.RUNNING, State.SILENT):
             self._watch_data(now)
 
     # -- finding and losing the device --------------------------------------------------------------------------
 
     def _search(self, message: str, now: int) -> None:
+        """Go back to listening for the device's broadcast."""
         self._dialogue.cancel()
-        self._connected = False
+        self._in_session = False
         self.state, self.message, self._began = State.SEARCHING, message, now
+
+    def _beat(self, now: int) -> None:
+        """Heartbeats go on when the device is lost: when only the cable was out it answers again at once."""
+        if now - self._heartbeat_sent >= HEARTBEAT_NS:
+            self._heartbeat_sent = now
+            self._put(General.HEARTBEAT)
+            self.counters["heartbeats"] += 1
+        if now - self._heard > LOST_NS and self.state != State.SEARCHING:
+            self._dialogue.cancel()
+            self.counters["device_lost"] += 1
+            self.state = State.SEARCHING
+            self.message = f"the Livox Avia {self.code} does not answer any more: check its power and cable"
 
     def _forgotten(self, now: int) -> bool:
         """A connected device announces itself again and is silent otherwise: it has restarted."""
         quiet = now - max(self._heard, self._last_data, self._began)
-        return self.state != State.CONNECTING and quiet > _ANSWERS_AGAIN_NS
+        return self.state == State.SEARCHING or quiet > _ANSWERS_AGAIN_NS
 
     def _connect(self, code: str, ip: str, now: int) -> None:
         host = self.config.host_ip or address_facing(ip, self._own_addresses())
@@ -199,12 +190,11 @@ class AviaSession:
                 f"give the network port one, such as {network[50]}/24"
             )
             return
-        if self._connected:
-            self.counters["restarts"] += 1
-        self.code, self.device_ip, self._connected = code, ip, True
+        self.code, self.device_ip = code, ip
+        self._in_session = False
         self._began = self._heard = now
-        self.state, self.message = State.CONNECTING, ""
-        self._dialogue.start(self._greeting(host, now), now)
+        self.state = State.CONNECTING  # an earlier message stands until the handshake has worked
+        self._dialogue.start(self._greeting(host), now)
 
     def _watch_data(self, now: int) -> None:
         quiet = now - max(self._last_data, self._running_since)
@@ -216,12 +206,27 @@ class AviaSession:
                 f"no data from the Livox Avia {self.code} for {quiet / 1e9:.1f} s: check its cable and power"
             )
             answering = now - self._heard < HEARTBEAT_NS + 500 * MS
-            if quiet > RESTART_NS and answering and not self._dialogue.running:
-                self._dialogue.start(self._configuration(now), now)
+            if quiet > RESTART_NS and answering:
+                self._dialogue.start(self._configuration(), now)
+
+    def identity(self) -> dict[str, str]:
+        """Serial number, address, firmware."""
+        return {"serial": self.code, "address": self.device_ip, "firmware": self.firmware}
+
+    def status(self) -> dict[str, str]:
+        """The device's own status in words."""
+        decoded = Status.decode(self.status_code)._asdict()
+        return {"work_state": self.work_state.name.lower()} | {
+            name: str(value) for name, value in decoded.items()
+        }
+
+    def resent(self) -> int:
+        """Commands that had to be repeated."""
+        return self._dialogue.resent
 
     # -- what is said -------------------------------------------------------------------------------------------
 
-    def _greeting(self, host: str, now: int) -> Script:
+    def _greeting(self, host: str) -> Script:
         port = self.config.data_port
         handshake = payloads.Handshake(host, port, self.config.command_port, port)
         answer = yield Ask(command(General.HANDSHAKE), handshake.encode(), tries=3)
@@ -239,21 +244,23 @@ class AviaSession:
             )
             return
         self.counters["sessions"] += 1
-        self.state = State.CONFIGURING
-        self._heartbeat_sent = 0  # at once: it tells the work state
-        yield from self._configuration(now)
+        self.message = ""
+        self._in_session = True
+        self._heartbeat_sent = 0  # the first one at once: its answer tells the work state
+        yield from self._configuration()
 
-    def _configuration(self, now: int) -> Script:
+    def _configuration(self) -> Script:
         self.state = State.CONFIGURING
         self.work_state = WorkState.INIT
         while self.work_state != WorkState.NORMAL:
             if self.work_state in (WorkState.POWER_SAVING, WorkState.STANDBY):
                 yield Ask(command(Lidar.MODE), bytes([WorkState.NORMAL]))
+                yield HEARTBEAT_NS
             yield _INIT_POLL_NS
         info = yield Ask(command(General.DEVICE_INFO))
         if info is not None and len(info) >= 5:
             self.firmware = ".".join(f"{b:02d}" for b in info[1:5])
-        for item in self._items():
+        for item in items(self.config):
             yield from self._apply(item)
         answer = yield Ask(command(General.SAMPLING), b"\1")
         if answer is None or answer[:1] != bytes([Ret.OK]):
@@ -267,41 +274,8 @@ class AviaSession:
     def _farewell(self) -> Script:
         yield Ask(command(General.SAMPLING), b"\0", tries=2)
         yield Ask(command(General.DISCONNECT), tries=1)
-        self._connected = False
+        self._in_session = False
         self.state, self.message = State.STOPPED, ""
-
-    def _items(self) -> Iterator[Item]:
-        c = self.config
-        spherical = c.coordinate == "spherical"
-        yield Item(
-            "coordinate", c.coordinate, Ask(command(General.COORDINATE), bytes([spherical])), None, b""
-        )
-        mode = bytes([RETURN_MODES.index(c.return_mode)])
-        yield self._item("return_mode", c.return_mode, Lidar.SET_RETURN_MODE, mode, Lidar.GET_RETURN_MODE)
-        yield self._item("imu", str(c.imu), Lidar.SET_IMU_RATE, bytes([c.imu]), Lidar.GET_IMU_RATE)
-        yield Item("rain_fog", str(c.rain_fog), Ask(command(Lidar.RAIN_FOG), bytes([c.rain_fog])), None, b"")
-        if c.high_sensitivity is not None:
-            yield self._param(
-                "high_sensitivity", Param.HIGH_SENSITIVITY, c.high_sensitivity, str(c.high_sensitivity)
-            )
-        if c.scan_pattern is not None:
-            yield self._param(
-                "scan_pattern", Param.SCAN_PATTERN, c.scan_pattern == "repetitive", c.scan_pattern
-            )
-        if c.extrinsic is not None:
-            e = c.extrinsic
-            value = payloads.Extrinsic(e.roll_deg, e.pitch_deg, e.yaw_deg, e.x_mm, e.y_mm, e.z_mm).encode()
-            yield self._item("extrinsic", str(e), Lidar.SET_EXTRINSIC, value, Lidar.GET_EXTRINSIC)
-
-    @staticmethod
-    def _item(name: str, requested: str, setter: Lidar, value: bytes, getter: Lidar) -> Item:
-        return Item(name, requested, Ask(command(setter), value), Ask(command(getter)), b"\0" + value)
-
-    @staticmethod
-    def _param(name: str, key: Param, value: bool, requested: str) -> Item:
-        pair = payloads.encode_params({key: bytes([value])})
-        read = Ask(command(General.GET_PARAMS), payloads.encode_keys([key]))
-        return Item(name, requested, Ask(command(General.SET_PARAMS), pair), read, b"\0\0\0\0" + pair)
 
     def _apply(self, item: Item) -> Script:
         began, tries = self._heard, 0
@@ -313,13 +287,16 @@ class AviaSession:
                 break
             yield _REFUSED_PAUSE_NS
         if answer is None or answer[:1] != bytes([Ret.OK]):
-            status, read_back = "refused", "no answer" if answer is None else f"error {answer.hex()}"
+            status, read_back = (
+                "refused",
+                _NOT_TAKEN[0] if answer is None else f"{_NOT_TAKEN[1]} {answer.hex()}",
+            )
         elif item.read is None:
             status, read_back = "unreadable", "accepted"
         else:
             back = yield item.read
             status = "unreadable" if back is None else "ok" if back.startswith(item.expected) else "refused"
-            read_back = "no answer" if back is None else item.requested if status == "ok" else back.hex()
+            read_back = _NOT_TAKEN[0] if back is None else item.requested if status == "ok" else back.hex()
         ms = (self._heard - began) / MS
         self.applied[item.name] = Applied(item.name, item.requested, read_back, status, tries, ms)
 
@@ -350,6 +327,8 @@ class AviaSession:
             return
         self._heard = now
         self.counters["heartbeats_answered"] += 1
+        if self.state == State.SEARCHING and self._in_session:
+            self._dialogue.start(self._configuration(), now)
         self.feature = beat.feature
         self.work_state = (
             WorkState(beat.work_state) if beat.work_state in list(WorkState) else WorkState.ERROR
@@ -358,7 +337,7 @@ class AviaSession:
             self.message = f"the Livox Avia {self.code} is starting up: {beat.detail} %"
         else:
             self.status_code = beat.detail
-            self._rain_fog_seen()
+            self._seen("rain_fog", str(bool(self.feature & 1)))
             if self.state in (State.RUNNING, State.CONFIGURING):
                 self.message = self._advice()
 
@@ -372,19 +351,13 @@ class AviaSession:
         ]
         return f"Livox Avia {self.code}: {', '.join(faults)}" if faults else ""
 
-    def _rain_fog_seen(self) -> None:
-        self._seen("rain_fog", str(bool(self.feature & 1)))
-
-    def _coordinate_seen(self, data_type: int) -> None:
-        self._seen("coordinate", "spherical" if data_type in (3, 5, 8) else "cartesian")
-        self.message = self._advice()
-
     def _seen(self, item: str, read_back: str) -> None:
         """Settings without a read command show in other messages."""
         was = self.applied.get(item)
-        if was is not None and was.read_back != read_back and was.status != "refused":
+        if was is not None and was.read_back != read_back and not was.read_back.startswith(_NOT_TAKEN):
             status = "ok" if was.requested == read_back else "refused"
             self.applied[item] = Applied(item, was.requested, read_back, status, was.tries, was.ms)
+            self.message = self._advice()
 
     # -- sending ------------------------------------------------------------------------------------------------
 
@@ -399,4 +372,4 @@ class AviaSession:
 
     def _put_ask(self, ask: Ask, seq: int) -> None:
         frame = Frame(Kind.CMD, seq, ask.command >> 8, ask.command & 0xFF, ask.payload)
-        self.outbox.append(Outgoing(encode(frame), (self.device_ip, COMMAND_PORT)))
+        self.outbox.append(Datagram(encode(frame), (self.device_ip, COMMAND_PORT)))

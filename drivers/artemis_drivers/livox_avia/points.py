@@ -87,6 +87,17 @@ class Decoder:
             self.points.publish(made[0])
             self.imu.publish(made[1])
 
+    def warm_up(self) -> None:
+        """Have the kernels compiled before the first packet arrives."""
+        decode_packets(
+            self._raw, 0, 0, self._points, 0, self._imu, 0, self.tracks, self.bad, self.last, self._anchor
+        )
+
+    def latest(self) -> tuple[int, int, int]:
+        """Data type of the latest points, status code and timestamp type of the latest packet."""
+        last = self.last[0]
+        return int(last["data_type"]), int(last["status"]), int(last["clock"])
+
     def counters(self) -> dict[str, int]:
         """Losses of both streams by name, and packets that could not be understood."""
         names = ("packets", "lost", "gaps", "late", "duplicates", "clock_steps", "clock_changes")
