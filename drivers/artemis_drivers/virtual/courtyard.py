@@ -81,7 +81,16 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
         sun=sun,
         atlas=atlas,
         movers=_movers(yard, atlas, seed, length),
+        looks_at=_sights(yard),
     )
+
+
+def _sights(yard: _Yard) -> F64:
+    """The statue in the middle, the terrace, and the fronts."""
+    middle = ((yard.west + yard.long) / 2, yard.wide / 2, 1.5)
+    rim = [(x, y, 1.0) for x in (yard.long * 0.4, yard.long * 0.75) for y in (1.5, yard.wide - 1.5)]
+    fronts = [(yard.long, yard.wide / 2, 5.0), (0.0, yard.wide / 2, 5.0)]
+    return np.array([middle, (1.9, yard.wide / 2, 1.2), *rim, *fronts])
 
 
 def _build(yard: _Yard, atlas: TextureAtlas, seed: int) -> WorldMesh:

@@ -27,6 +27,12 @@ def any_colour(rng: Rng, low: float, high: float) -> Colour:
     return (float(r), float(g), float(b))
 
 
+def wall_paint(rng: Rng) -> Colour:
+    """What walls and floors are painted with: light, and of any hue, but pale."""
+    r, g, b = np.clip(rng.uniform(0.65, 1.0) * rng.uniform(0.82, 1.1, 3), 0, 1)
+    return (float(r), float(g), float(b))
+
+
 def wall(width: float, z0: float, z1: float, thickness: float, openings: Sequence[Opening] = ()) -> Shape:
     """Closed wall, front in the x-z plane facing -y, 0..width, with openings right through it."""
     xs = np.unique([0.0, width, *(x for o in openings for x in o[:2])])
@@ -100,7 +106,7 @@ def add_shelf(builder: MeshBuilder, rng: Rng, T: F64, bays: int, kind: str = "bo
     builder.begin("shelf")
     deep, high, boards = 0.34, rng.uniform(1.7, 2.3), int(rng.integers(4, 6))
     colour = any_colour(rng, 0.25, 1.0)
-    material = str(rng.choice(["wood", "metal"]))
+    material = str(rng.choice(["wood", "bare"]))
     frame = [box((k * _BAY_M - 0.015, 0, -0.02), (k * _BAY_M + 0.015, deep, high)) for k in range(bays + 1)]
     zs = np.linspace(0.08, high - 0.02, boards)
     frame += [box((0, 0.005, z - 0.012), (bays * _BAY_M, deep - 0.005, z + 0.012)) for z in zs]
