@@ -1,0 +1,1 @@
+"""The trigger board on CAN: it gives LiDAR and cameras their pulses, and tells the time of each of them."""
