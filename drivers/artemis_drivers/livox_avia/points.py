@@ -122,14 +122,17 @@ LAST = np.dtype([("status", "u4"), ("clock", "u1"), ("data_type", "u1")])
 
 
 @njit
-def _u16(b: NDArray[np.uint8], at: int) -> int:
-    value: int = int(b[at]) | int(b[at + 1]) << 8
+def _u16(b: NDArray[np.uint8], at: int) -> np.int64:
+    # int() of a byte would be unsigned in compiled code, and unsigned with signed becomes a float there
+    value: np.int64 = np.int64(b[at]) | np.int64(b[at + 1]) << 8
     return value
 
 
 @njit
-def _u32(b: NDArray[np.uint8], at: int) -> int:
-    value: int = int(b[at]) | int(b[at + 1]) << 8 | int(b[at + 2]) << 16 | int(b[at + 3]) << 24
+def _u32(b: NDArray[np.uint8], at: int) -> np.int64:
+    value: np.int64 = (
+        np.int64(b[at]) | np.int64(b[at + 1]) << 8 | np.int64(b[at + 2]) << 16 | np.int64(b[at + 3]) << 24
+    )
     return value
 
 
@@ -147,13 +150,12 @@ def packet_time(b: NDArray[np.uint8], rx: int, anchor: NDArray[np.int64]) -> int
     """
     kind = b[8]
     if kind == CLOCK_GPS:
-        days = days_of(2000 + int(b[10]), int(b[11]), int(b[12]))
-        microseconds = _u32(b, 14)
+        days = days_of(2000 + np.int64(b[10]), np.int64(b[11]), np.int64(b[12]))
+        microseconds = int(_u32(b, 14))
         if days < 0 or b[13] > 23 or microseconds >= 3_600_000_000:
             return -1
-        since_1970: int = ((days * 24 + int(b[13])) * 3_600_000_000 + microseconds) * 1000
-        return since_1970
-    time: int = _u32(b, 10) | _u32(b, 14) << 32
+        return int(((days * 24 + np.int64(b[13])) * 3_600_000_000 + microseconds) * 1000)
+    time = int(_u32(b, 10) | _u32(b, 14) << 32)
     if time < 0 or kind not in (CLOCK_NONE, CLOCK_PTP, CLOCK_PPS):
         return -1
     if kind == CLOCK_PPS:
@@ -247,10 +249,10 @@ def decode_packets(
         if stamp < 0:
             bad[0].time += 1
             continue
-        kind = int(b[9])
+        kind = np.int64(b[9])
         stream = IMU if kind == IMU_TYPE else POINTS
         period = IMU_PERIOD_NS if kind == IMU_TYPE else int(SHOTS[kind] * SHOT_NS)
-        if track(tracks, stream, stamp, int(b[8]), rx, period) == DUPLICATE:
+        if track(tracks, stream, stamp, np.int64(b[8]), rx, period) == DUPLICATE:
             continue
         last[0].status, last[0].clock = _u32(b, 4), b[8]
         if kind == IMU_TYPE:
@@ -265,7 +267,7 @@ def decode_packets(
 
 @njit
 def _put_points(b: NDArray[np.uint8], stamp: int, rx: int, number: int, p: PointArrays, at: int) -> None:
-    kind = int(b[9])
+    kind = np.int64(b[9])
     shots, returns = SHOTS[kind], RETURNS[kind]
     p.stamp_ns[at], p.rx_ns[at], p.packet[at] = stamp, rx, number
     p.shot_ns[at], p.status[at] = SHOT_NS, _u32(b, 4)

@@ -80,8 +80,8 @@ class Faults:
     reorder_data: float = 0.0
     lose_replies: float = 0.0
     duplicate_replies: float = 0.0
-    pack_replies: bool = False
-    """Two replies in one datagram, as seen of a Tele-15."""
+    pack_replies: float = 0.0
+    """A reply is held back and sent in one datagram with the next one, as seen of a Tele-15."""
     refuse: frozenset[tuple[int, int]] = frozenset()
     """(command set, command) answered with an error."""
     unplugged: bool = False
@@ -369,8 +369,9 @@ class VirtualAvia:
         if self._random.random() < self.faults.lose_replies:
             self.counters["replies_lost"] += 1
             return
-        if self.faults.pack_replies and self._held_reply is None:
-            self._held_reply = reply  # goes out together with the next one; the host asks again meanwhile
+        if self._held_reply is None and self._random.random() < self.faults.pack_replies:
+            self._held_reply = reply  # the host asks again meanwhile
+            self.counters["replies_packed"] += 1
             return
         reply, self._held_reply = (self._held_reply or b"") + reply, None
         self._send(reply, to)
