@@ -126,7 +126,7 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
 
 def _path(layout: _Layout, rng: Rng) -> F64:
     """The walker keeps to the right half of the road, in part of which cars drive, and drifts from side to side."""
-    x = np.arange(END_MARGIN_M, layout.length - END_MARGIN_M, 0.5)
+    x = np.arange(END_MARGIN_M, layout.length - END_MARGIN_M, 0.4)
     phase = rng.uniform(0, 2 * np.pi, 2)
     drift = 0.6 * np.sin(2 * np.pi * x / 31.0 + phase[0]) + 0.3 * np.sin(2 * np.pi * x / 13.7 + phase[1])
     # from beside the parked cars, which take 2.1 m, to beside the driving ones
