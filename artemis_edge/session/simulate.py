@@ -17,7 +17,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from artemis_drivers.virtual import avia, street
-from artemis_drivers.virtual.camera import CameraSpec, VirtualCamera
+from artemis_drivers.virtual.camera import CameraSpec, Photo, VirtualCamera
 from artemis_drivers.virtual.imu import ImuRecord, ImuSpec, measure
 from artemis_drivers.virtual.lidar import Frame, LidarSpec, Pattern, scan
 from artemis_drivers.virtual.mesh_builder import WorldMesh
@@ -32,8 +32,7 @@ from scipy.spatial.transform import Rotation
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import replacing, write_bytes
 from artemis_edge.export.ply import bare_mesh, write_ply
-from artemis_edge.frames import F32, F64, I32, CameraModel, Trajectory
-from artemis_edge.raster import NOTHING, Projection, draw, project
+from artemis_edge.frames import F32, F64, CameraModel, Trajectory
 from artemis_edge.session.writer import SessionWriter
 from artemis_edge.trajectory import inverse, write_tum
 
@@ -42,7 +41,6 @@ FRAME_NS = 100_000_000
 WORLDS = ("street",)
 LIDARS: dict[str, Pattern] = {"avia": avia.beams}
 _TRUTH_HZ = 400
-_NEAR_M = 0.05
 _LONG_WALK_S = 300.0
 
 #: Called with (frames done, frames in all).
@@ -124,6 +122,11 @@ class _Rig:
     def __post_init__(self) -> None:
         self.window = Window(self.world, self.settings.reach_m)
 
+    def camera_pose(self, time_s: float) -> F64:
+        """T_world_cam at a time of the walk."""
+        pose: F64 = self.motion.pose(time_s)[0] @ T_IMU_LIDAR @ T_LIDAR_CAM
+        return pose
+
 
 def simulate(
     world_name: str,
@@ -188,27 +191,9 @@ def _build_rig(world_name: str, seed: int, seconds: float, lidar: str, s: Settin
     motion = walk(world.path, seconds + 0.2, seed, gait)
     imu = measure(motion, ImuSpec().scaled(s.imu_noise), seed, seconds) if s.imu else None
     spec = CameraSpec(jpeg_quality=s.jpeg_quality).scaled(s.image_width)
-    camera = VirtualCamera(spec, rasterise, seed) if s.camera else None
+    camera = VirtualCamera(spec, seed) if s.camera else None
     physics = LidarSpec(range_noise_m=s.range_noise_m, angular_noise=np.radians(s.angular_noise_deg))
     return _Rig(world, motion, LIDARS[lidar], lidar, physics, imu, camera, s, seed)
-
-
-def rasterise(
-    vertices: F32,
-    triangles: I32,
-    T_view_world: F64,
-    view: tuple[float, float, float, float],
-    size: tuple[int, int],
-    orthographic: bool,
-) -> tuple[I32, F32]:
-    """The rasteriser of this package in the form that the virtual camera asks for (shading.Rasteriser)."""
-    projection = Projection(*view, _NEAR_M, orthographic, True)
-    points, image = np.empty_like(vertices), np.empty_like(vertices)
-    project(vertices, T_view_world, projection, points, image)
-    nearness = np.full((size[1], size[0]), -np.inf, np.float32)
-    triangle = np.full((size[1], size[0]), NOTHING, np.int32)
-    draw(points, image, triangles, projection, 0, nearness, triangle)
-    return triangle, nearness
 
 
 def _record(rig: _Rig, frames: int, path: Path, store: HitStore, progress: Progress | None) -> dict[str, int]:
@@ -224,19 +209,18 @@ def _record(rig: _Rig, frames: int, path: Path, store: HitStore, progress: Progr
             photo = _start_photo(rig, scene, k, photographer)
             frame = _scan(rig, scene, k)
             if wants_reference:
-                store.add(frame.hit, frame.origin, scene.mesh.instance[frame.triangle])
+                store.add(frame.hit, frame.origin, scene.instance[frame.triangle])
             _write_frame(writer, rig, k, frame, photo, counts)
             if progress is not None:
                 progress(k + 1, frames)
     return counts
 
 
-def _start_photo(rig: _Rig, scene: Scene, k: int, pool: ThreadPoolExecutor) -> Future[bytes] | None:
+def _start_photo(rig: _Rig, scene: Scene, k: int, pool: ThreadPoolExecutor) -> Future[Photo] | None:
     """The photograph is taken in the middle of the LiDAR's window, on another core while that scans."""
     if rig.camera is None or k % rig.settings.camera_every:
         return None
-    T_world_cam = rig.motion.pose(k * 0.1 + 0.05)[0] @ T_IMU_LIDAR @ T_LIDAR_CAM
-    return pool.submit(rig.camera.photograph, scene, rig.world.sun, T_world_cam, k)
+    return pool.submit(rig.camera.photograph, scene, rig.world.sun, rig.camera_pose, k * 0.1 + 0.05, k)
 
 
 def _scan(rig: _Rig, scene: Scene, k: int) -> Frame:
@@ -259,7 +243,7 @@ def _write_frame(
     rig: _Rig,
     k: int,
     frame: Frame,
-    photo: Future[bytes] | None,
+    photo: Future[Photo] | None,
     counts: dict[str, int],
 ) -> None:
     """Messages of one window in the order in which a host would receive them."""
@@ -306,11 +290,11 @@ def _write_imu(writer: SessionWriter, imu: ImuRecord | None, sample: int, counts
 
 
 def _write_photo(
-    writer: SessionWriter, rig: _Rig, stamp: int, photo: Future[bytes], counts: dict[str, int]
+    writer: SessionWriter, rig: _Rig, stamp: int, photo: Future[Photo], counts: dict[str, int]
 ) -> None:
     assert rig.camera is not None
     received = stamp + 20_000_000  # exposure, readout and transfer
-    writer.write_image(stamp, photo.result(), receive_ns=received)
+    writer.write_image(stamp, photo.result().data, receive_ns=received)
     writer.write_camera_info(stamp, _camera_model(rig.camera.spec), receive_ns=received)
     counts["images"] += 1
 

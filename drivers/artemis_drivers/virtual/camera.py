@@ -1,31 +1,57 @@
-"""A global-shutter colour camera: pinhole with Brown-Conrady distortion, lit, shadowed, noisy, JPEG.
+"""A global-shutter colour camera: pinhole with Brown-Conrady distortion and vignetting, lit, shadowed, blurred
+by its true motion within the exposure, noisy, as JPEG or as Bayer mosaic.
 
-Exposure is instantaneous here; stamps are those of the middle of the exposure.
+The image is rendered once, in the middle of the exposure; motion blur is a filter along each pixel's own path
+over the exposure, which follows from its depth and from the true motion of camera and mover. Not modelled: what
+a mover's silhouette uncovers within the exposure, lens blur, rolling shutter, flare.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import cv2
 import numpy as np
 
-from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
 from artemis_drivers.virtual.scene import Scene
-from artemis_drivers.virtual.shading import Rasteriser, ShadowMap, shade_image, shadow_map
+from artemis_drivers.virtual.sensor import (
+    AutoExposure,
+    Exposure,
+    Optics,
+    SensorSpec,
+    amplifier,
+    bayer_bytes,
+    cut,
+    developed,
+    expose,
+    metered,
+    white_noise,
+)
+from artemis_drivers.virtual.shading import (
+    Film,
+    Parts,
+    ShadowMap,
+    local_vertices,
+    shade_pixels,
+    shadow_map,
+)
+from artemis_drivers.virtual.spans import Canvas, View, clear, draw, new_canvas
 
 _OVERSAMPLING = 2.0  # canvas pixels per image pixel, along each axis
-_EXPOSURE_GAIN = 1.15
 _UNDISTORT_STEPS = 30
-_NOISE_MARGIN = 256
+
+#: T_world_cam (4, 4) at a time in seconds.
+CameraPath = Callable[[float], F64]
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSpec:
-    """Pixels; distortion k1, k2, p1, p2, k3. Defaults: 1/1.8 inch sensor behind a 6 mm lens, 71 degrees wide.
+    """Pixels; distortion k1, k2, p1, p2, k3. Defaults: 4.8 um pixels behind a 4.3 mm lens, 71 degrees wide.
 
-    ``noise`` is the standard deviation of a mid-grey pixel of 8 bits, shot noise plus read noise.
+    ``vignetting`` is the exponent of the cosine of the field angle: 4 is that of an ideal lens.
     """
 
     width: int = 1280
@@ -35,25 +61,33 @@ class CameraSpec:
     cx: float = 644.5
     cy: float = 508.0
     distortion: tuple[float, float, float, float, float] = (-0.09, 0.06, 0.0004, -0.0003, -0.01)
-    noise: float = 1.5
+    vignetting: float = 4.0
     jpeg_quality: int = 92
-    exposure_s: float = 0.004
+    output: Literal["jpeg", "bayer"] = "jpeg"
+    sensor: SensorSpec = field(default_factory=SensorSpec)
 
     def scaled(self, width: int) -> CameraSpec:
         """The same view at another resolution (aspect kept)."""
         s = width / self.width
-        return CameraSpec(
-            width,
-            round(self.height * s),
-            self.fx * s,
-            self.fy * s,
-            (self.cx + 0.5) * s - 0.5,
-            (self.cy + 0.5) * s - 0.5,
-            self.distortion,
-            self.noise,
-            self.jpeg_quality,
-            self.exposure_s,
+        return replace(
+            self,
+            width=width,
+            height=round(self.height * s),
+            fx=self.fx * s,
+            fy=self.fy * s,
+            cx=(self.cx + 0.5) * s - 0.5,
+            cy=(self.cy + 0.5) * s - 0.5,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Photo:
+    """``data``: JPEG, or row by row the bytes of the mosaic (``encoding`` "jpeg" or "bayer_rggb8")."""
+
+    data: bytes
+    encoding: str
+    exposure_s: float
+    gain: float
 
 
 def distort(x: F64, y: F64, k: tuple[float, float, float, float, float]) -> tuple[F64, F64]:
@@ -77,19 +111,23 @@ def undistort(xd: F64, yd: F64, k: tuple[float, float, float, float, float]) -> 
 
 @dataclass(slots=True)
 class VirtualCamera:
-    """Renders photographs of a scene; keeps what does not change from image to image."""
+    """Takes photographs of a scene; keeps what does not change from image to image, and the exposure control:
+    photographs must be taken in order.
+    """
 
     spec: CameraSpec
-    rasterise: Rasteriser
     seed: int
     lines: F32 = field(init=False)
-    canvas: I32 = field(init=False)
-    canvas_size: tuple[int, int] = field(init=False)
-    canvas_view: tuple[float, float, float, float] = field(init=False)
-    _shadow: ShadowMap | None = field(default=None, init=False)
-    _shadow_of: Scene | None = field(default=None, init=False)
-    _local: F32 = field(init=False)
+    sub_pixels: I32 = field(init=False)
+    view: View = field(init=False)
+    _canvas: Canvas = field(init=False)
+    _film: Film = field(init=False)
+    _falloff: F32 = field(init=False)
     _noise: F32 = field(init=False)
+    _exposure: AutoExposure = field(init=False)
+    _scene: Scene | None = field(default=None, init=False)
+    _shadow: ShadowMap = field(init=False)
+    _local: F32 = field(init=False)
 
     def __post_init__(self) -> None:
         """Lines of sight of all sub-pixels and where they fall on the undistorted canvas."""
@@ -103,80 +141,146 @@ class VirtualCamera:
         low, high = lines.min(axis=(0, 1, 2)), lines.max(axis=(0, 1, 2))
         fx, fy = s.fx * _OVERSAMPLING, s.fy * _OVERSAMPLING
         width, height = int((high[0] - low[0]) * fx) + 3, int((high[1] - low[1]) * fy) + 3
-        self.canvas_view = (fx, fy, 1 - low[0] * fx, 1 - low[1] * fy)
-        column = np.rint(lines[:, :, :4, 0] * fx + self.canvas_view[2]).astype(np.int32)
-        row = np.rint(lines[:, :, :4, 1] * fy + self.canvas_view[3]).astype(np.int32)
-        self.canvas_size = (width, height)
-        self.canvas = row * np.int32(width) + column
+        self.view = View(fx, fy, float(1 - low[0] * fx), float(1 - low[1] * fy), False)
+        column = np.rint(lines[:, :, :4, 0] * fx + self.view.cx).astype(np.int32)
+        row = np.rint(lines[:, :, :4, 1] * fy + self.view.cy).astype(np.int32)
+        self._canvas = new_canvas(width, height)
+        self.sub_pixels = row * np.int32(width) + column
         self.lines = lines.astype(np.float32)
-        rng = np.random.default_rng([self.seed, 13])
-        shape = (s.height + _NOISE_MARGIN, s.width + _NOISE_MARGIN, 3)
-        self._noise = rng.standard_normal(shape, np.float32)
-
-    def render(self, scene: Scene, sun: F64, T_world_cam: F64) -> F32:
-        """Linear light float32 (h, w, 3), 1 = white."""
-        if scene is not self._shadow_of or self._shadow is None:
-            self._local = (scene.mesh.vertices - scene.origin.astype(np.float32)).astype(np.float32)
-            self._shadow = shadow_map(scene, sun, self.rasterise)
-            self._shadow_of = scene
-        T_view_local = np.eye(4)
-        T_view_local[:3, :3] = T_world_cam[:3, :3].T
-        T_view_local[:3, 3] = -T_world_cam[:3, :3].T @ (T_world_cam[:3, 3] - scene.origin)
-        ids = self._visible(scene, T_view_local)
-        return shade_image(scene, self._shadow, ids, self.lines, self.canvas, T_world_cam, 1.0 / self.spec.fx)
-
-    def _visible(self, scene: Scene, T_view_local: F64) -> I32:
-        """Numbers of the triangles seen per canvas pixel; only objects within the view are drawn."""
-        fx, fy, cx, cy = self.canvas_view
-        width, height = self.canvas_size
-        centre, radius = scene.object_centre, scene.object_radius
-        seen = centre @ T_view_local[:3, :3].T + T_view_local[:3, 3]
-        inside = seen[:, 2] > -radius
-        # the four planes through the eye and the image's borders, normals inwards
-        for x, y in ((cx / fx, 0), ((width - cx) / fx, 0), (0, cy / fy), (0, (height - cy) / fy)):
-            sign = 1.0 if (x, y) in ((cx / fx, 0), (0, cy / fy)) else -1.0
-            axis = seen[:, 0] if y == 0 else seen[:, 1]
-            slope = x + y
-            inside &= sign * axis + slope * seen[:, 2] > -radius * np.hypot(1.0, slope)
-        chosen = np.flatnonzero(inside[scene.object_of])
-        ids, _ = self.rasterise(
-            self._local,
-            scene.mesh.triangles[chosen],
-            T_view_local,
-            self.canvas_view,
-            self.canvas_size,
-            False,
+        count = s.height * s.width
+        self._film = Film(
+            np.empty((count, 3), np.float32), np.empty(count, np.float32), np.empty(count, np.int16)
         )
-        return np.append(chosen, -1).astype(np.int32)[ids]
+        cosine = 1 / np.sqrt(1 + (lines[:, :, 4] ** 2).sum(axis=2))
+        self._falloff = (cosine**s.vignetting).astype(np.float32)
+        self._noise = white_noise(s.height, s.width, self.seed)
+        self._exposure = AutoExposure(s.sensor)
 
-    def develop(self, light: F32, index: int) -> U8:
-        """8-bit RGB of linear light, with the sensor's noise of image ``index``."""
-        rng = np.random.default_rng([self.seed, 11, index])
-        # one field of white noise, cut at another place for every image: as random, much cheaper
-        row, column = rng.integers(0, _NOISE_MARGIN, 2)
-        height, width = light.shape[:2]
-        noise = self._noise[row : row + height, column : column + width]
-        out = np.empty(light.shape, np.uint8)
-        _develop(light, noise, self.spec.noise, _EXPOSURE_GAIN, out)
-        return out
+    def render(self, scene: Scene, sun: F64, T_world_cam: F64, time_s: float = 0.0) -> F32:
+        """Linear light float32 (h, w, 3), 1 = white: no blur, no vignetting, no noise."""
+        self._see(scene, sun, T_world_cam, time_s)
+        return self._film.light.reshape(self.spec.height, self.spec.width, 3).copy()
 
-    def photograph(self, scene: Scene, sun: F64, T_world_cam: F64, index: int) -> bytes:
-        """JPEG bytes of image ``index``."""
-        rgb = self.develop(self.render(scene, sun, T_world_cam), index)
-        return encode_jpeg(rgb, self.spec.jpeg_quality)
+    def photograph(self, scene: Scene, sun: F64, path: CameraPath, time_s: float, index: int) -> Photo:
+        """Photograph ``index``, the middle of whose exposure is at ``time_s``."""
+        parts = self._see(scene, sun, path(time_s), time_s)
+        used = self._exposure.next(float((self._film.light[::8, 1] * self._falloff.reshape(-1)[::8]).mean()))
+        raw = self._raw(scene, parts, path, time_s, used, index)
+        self._exposure.measured(used, metered(raw, self.spec.sensor))
+        if self.spec.output == "bayer":
+            data, encoding = bayer_bytes(raw, self.spec.sensor).tobytes(), "bayer_rggb8"
+        else:
+            data, encoding = encode_jpeg(developed(raw, self.spec.sensor), self.spec.jpeg_quality), "jpeg"
+        return Photo(data, encoding, used.exposure_s, used.gain)
+
+    def _raw(
+        self, scene: Scene, parts: Parts, path: CameraPath, time_s: float, used: Exposure, index: int
+    ) -> np.ndarray[tuple[int, int], np.dtype[np.uint16]]:
+        s = self.spec
+        raw = np.empty((s.height, s.width), np.uint16)
+        expose(
+            self._film,
+            self.lines[:, :, 4],
+            _moved(scene, parts, path, time_s, used.exposure_s),
+            Optics(s.fx, s.fy, s.distortion),
+            self._falloff,
+            cut(self._noise, self.seed, index),
+            np.array(s.sensor.efficiency),
+            amplifier(s.sensor, used),
+            raw,
+        )
+        return raw
+
+    def _see(self, scene: Scene, sun: F64, T_world_cam: F64, time_s: float) -> Parts:
+        """Fill the film with what is seen."""
+        if scene is not self._scene:
+            self._local = local_vertices(scene)
+            self._shadow = shadow_map(scene, sun, self._local)
+            self._scene = scene
+        parts = _parts(scene, T_world_cam, time_s)
+        self._draw(scene, parts)
+        shade_pixels(
+            scene.surface,
+            scene.atlas.arrays,
+            self._shadow,
+            parts,
+            self._canvas.triangle.reshape(-1),
+            self.sub_pixels.reshape(-1, 4),
+            self.lines.reshape(-1, 5, 2),
+            1.0 / self.spec.fx,
+            self._film,
+        )
+        return parts
+
+    def _draw(self, scene: Scene, parts: Parts) -> None:
+        """Numbers of the triangles seen per canvas pixel; only objects within the view are drawn."""
+        clear(self._canvas)
+        T = _view_of(parts, 0)
+        seen = scene.object_centre @ T[:3, :3].T + T[:3, 3]
+        chosen = np.flatnonzero(self._within(seen, scene.object_radius)[scene.object_of]).astype(np.int32)
+        draw(self._canvas, self.view, T, self._local, scene.mesh.triangles, chosen, 0)
+        for k, mover in enumerate(scene.movers, start=1):
+            T = _view_of(parts, k)
+            if self._within(T[None, :3, 3], np.array([mover.radius]))[0]:
+                local = (mover.mesh.vertices - mover.bvh.origin).astype(np.float32)
+                every = np.arange(len(mover.mesh.triangles), dtype=np.int32)
+                draw(self._canvas, self.view, T, local, mover.mesh.triangles, every, mover.first)
+
+    def _within(self, centre: F64, radius: F64) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Whether spheres (n, 3) in view coordinates may be seen."""
+        fx, fy, cx, cy, _ = self.view
+        height, width = self._canvas.nearness.shape
+        inside = centre[:, 2] > -radius
+        # the four planes through the eye and the image's borders, normals inwards
+        for axis, sign, slope in (
+            (0, 1.0, cx / fx),
+            (0, -1.0, (width - cx) / fx),
+            (1, 1.0, cy / fy),
+            (1, -1.0, (height - cy) / fy),
+        ):
+            inside &= sign * centre[:, axis] + slope * centre[:, 2] > -radius * np.hypot(1.0, slope)
+        return inside
 
 
-@njit
-def _develop(light: F32, noise: F32, sigma: float, gain: float, out: U8) -> None:
-    """Gain, square root as the transfer curve, noise, 8 bits."""
-    for i in range(light.shape[0]):
-        for j in range(light.shape[1]):
-            for a in range(3):
-                value = np.sqrt(max(light[i, j, a] * gain, 0.0)) * 255.0 + noise[i, j, a] * sigma
-                out[i, j, a] = int(min(max(value, 0.0), 255.0) + 0.5)
+def _parts(scene: Scene, T_world_cam: F64, time_s: float) -> Parts:
+    count = 1 + len(scene.movers)
+    first = np.zeros(count, np.int32)
+    T_world_local = np.tile(np.eye(4), (count, 1, 1))
+    T_world_local[0, :3, 3] = scene.origin
+    for k, mover in enumerate(scene.movers, start=1):
+        first[k], T_world_local[k] = mover.first, mover.pose(time_s)[0]
+    turned = np.swapaxes(T_world_local[:, :3, :3], 1, 2)
+    away = T_world_cam[:3, 3] - T_world_local[:, :3, 3]
+    return Parts(
+        first,
+        np.einsum("nij,nj->ni", turned, away),
+        np.ascontiguousarray(turned @ T_world_cam[:3, :3]),
+        np.ascontiguousarray(T_world_local[:, :3, :3]),
+        T_world_local[:, :3, 3] - scene.origin,
+    )
 
 
-def encode_jpeg(rgb: U8, quality: int) -> bytes:
-    """JPEG bytes of an RGB picture."""
-    _, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+def _moved(scene: Scene, parts: Parts, path: CameraPath, time_s: float, exposure_s: float) -> F64:
+    """Per part D (k, 4, 4): its points p in the camera move by D (p, 1) over the exposure around ``time_s``."""
+    D = np.zeros((len(parts.first), 4, 4))
+    for sign in (-1.0, 1.0):
+        then = _parts(scene, path(time_s + sign * exposure_s / 2), time_s + sign * exposure_s / 2)
+        for k in range(len(D)):
+            R = then.R_local_cam[k].T
+            D[k, :3, :3] += sign * R @ parts.R_local_cam[k]
+            D[k, :3, 3] += sign * R @ (parts.eye[k] - then.eye[k])
+    return D
+
+
+def _view_of(parts: Parts, k: int) -> F64:
+    """T_cam_local of a part."""
+    T = np.eye(4)
+    T[:3, :3] = parts.R_local_cam[k].T
+    T[:3, 3] = -T[:3, :3] @ parts.eye[k]
+    return T
+
+
+def encode_jpeg(bgr: U8, quality: int) -> bytes:
+    """JPEG bytes of a BGR picture."""
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return data.tobytes()

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_drivers._jit import njit
-from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
-from artemis_drivers.virtual.scene import Scene
-from artemis_drivers.virtual.textures import LEVELS, MACRO, MACRO_M, SIZE
+from artemis_drivers._jit import kernel, njit
+from artemis_drivers.virtual.mesh_builder import F32, F64, I32
+from artemis_drivers.virtual.scene import Scene, Surface
+from artemis_drivers.virtual.spans import View, draw, new_canvas
+from artemis_drivers.virtual.textures import LEVELS, MACRO, MACRO_M, SIZE, TextureArrays
 
+I16 = NDArray[np.int16]
 I64 = NDArray[np.int64]
-U32 = NDArray[np.uint32]
 Vector = tuple[Any, Any, Any]  # scalars of a kernel
 
-#: Draws triangles: (vertices float32 (n, 3), triangles, T_view_world, (fx, fy, cx, cy), (width, height),
-#: orthographic) -> (number of the triangle per pixel, -1 where none; nearness per pixel: 1/z, or -z when
-#: orthographic). View coordinates x right, y down, z forward; pixel centres at integers; back faces culled.
-Rasteriser = Callable[
-    [F32, I32, F64, tuple[float, float, float, float], tuple[int, int], bool], tuple[I32, F32]
-]
 _SHADOW_M = 0.05  # size of a pixel of the shadow map
 _SHADOW_BIAS_M = 0.06
 _LARGEST_SHADOW = 8192
@@ -30,6 +24,11 @@ _SUN = (1.25, 1.15, 0.98)  # linear light of the sun and of the sky
 _SKY = (0.42, 0.47, 0.56)
 _SLOW_LOD = float(np.log2(SIZE / MACRO_M))
 _MACRO_MEAN = 217.0  # of 0..255, so that the slow picture keeps the mean brightness
+_LANE = 21  # bits of one colour while four texels are added up
+_LANE_MASK = (1 << _LANE) - 1
+_STEP_BITS = 6
+# positions between two texels: products of two weights have 12 bits, so that a colour stays in its lane
+_STEPS = 1 << _STEP_BITS
 
 
 class ShadowMap(NamedTuple):
@@ -44,59 +43,103 @@ class ShadowMap(NamedTuple):
     sun: F32
 
 
-def shadow_map(scene: Scene, sun: F64, rasterise: Rasteriser) -> ShadowMap:
-    """What the sun sees of the scene."""
+class Parts(NamedTuple):
+    """The frames of what stands still (row 0) and of each mover (k, ...) at the time of an image.
+
+    ``first`` int32 (k,) number of the first triangle; ``eye`` float64 (k, 3) and ``R_local_cam`` (k, 3, 3):
+    the camera in the part's local frame; ``R_scene_local`` and ``t_scene_local``: the part in the scene's.
+    """
+
+    first: I32
+    eye: F64
+    R_local_cam: F64
+    R_scene_local: F64
+    t_scene_local: F64
+
+
+class Film(NamedTuple):
+    """What arrives at the pixels (n): ``light`` float32 (n, 3), linear, 1 = white; ``depth`` float32 (n,)
+    metres along z, inf for the sky; ``part`` int16 (n,) row of :class:`Parts`.
+    """
+
+    light: F32
+    depth: F32
+    part: I16
+
+
+def local_vertices(scene: Scene) -> F32:
+    """Vertices of what stands still, relative to the scene's origin."""
+    return np.asarray(scene.mesh.vertices - scene.origin.astype(np.float32), np.float32)
+
+
+def shadow_map(scene: Scene, sun: F64, local: F32) -> ShadowMap:
+    """What the sun sees of what stands still; ``local`` are its vertices relative to the scene's origin."""
     forward = -sun
-    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = np.cross(forward, [0.0, 0.0, 1.0] if abs(sun[2]) < 0.999 else [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
     R = np.stack([right, np.cross(forward, right), forward])
-    local = (scene.mesh.vertices - scene.origin.astype(np.float32)).astype(np.float32)
     seen = local @ R.T.astype(np.float32)
     low, high = seen.min(axis=0), seen.max(axis=0)
     pixel = max(_SHADOW_M, float((high - low)[:2].max()) / _LARGEST_SHADOW)
-    size = (int((high[0] - low[0]) / pixel) + 2, int((high[1] - low[1]) / pixel) + 2)
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = -low[0], -low[1], -low[2]
-    _, nearness = rasterise(local, scene.mesh.triangles, T, (1 / pixel, 1 / pixel, 0.0, 0.0), size, True)
+    canvas = new_canvas(int((high[0] - low[0]) / pixel) + 2, int((high[1] - low[1]) / pixel) + 2, named=False)
+    every = np.arange(len(scene.mesh.triangles), dtype=np.int32)
+    draw(canvas, View(1 / pixel, 1 / pixel, 0.0, 0.0, True), T, local, scene.mesh.triangles, every, 0)
     rows = np.concatenate([R, T[:3, 3:]], axis=1)
     rows[:2] /= pixel
-    depth = np.where(np.isfinite(nearness), -nearness, np.inf).astype(np.float32)
+    depth = np.negative(canvas.nearness, out=canvas.nearness)
     return ShadowMap(depth, rows.astype(np.float32), sun.astype(np.float32))
 
 
-@njit
+@kernel(forceinline=True)
+def _lanes(texel: Any) -> Any:
+    """The three bytes of a texel, _LANE bits apart."""
+    t = np.int64(texel)
+    return t & 0xFF | (t & 0xFF00) << (_LANE - 8) | (t & 0xFF0000) << (2 * _LANE - 16)
+
+
+@kernel(forceinline=True)
 def _bilinear(texels: I32, first: int, size: int, u: float, v: float) -> Vector:
     """Colour 0..255 at picture coordinates u, v (1 = one repetition, v upwards)."""
-    x, y = u * size - 0.5, (1.0 - v) * size - 0.5
-    x0, y0 = int(np.floor(x)), int(np.floor(y))
-    fx, fy = x - x0, y - y0
+    x, y = (u * size - 0.5) * _STEPS, ((1.0 - v) * size - 0.5) * _STEPS
+    column, row = int(np.floor(x)), int(np.floor(y))
+    fx, fy = column & (_STEPS - 1), row & (_STEPS - 1)
     mask = size - 1
-    left, right = x0 & mask, (x0 + 1) & mask
-    upper, lower = first + (y0 & mask) * size, first + ((y0 + 1) & mask) * size
-    a, b, c, d = texels[upper + left], texels[upper + right], texels[lower + left], texels[lower + right]
-    wa, wb, wc, wd = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
+    column, row = column >> _STEP_BITS, row >> _STEP_BITS
+    left, right = column & mask, (column + 1) & mask
+    upper, lower = first + (row & mask) * size, first + ((row + 1) & mask) * size
+    gx, gy = _STEPS - fx, _STEPS - fy
+    total = _lanes(texels[upper + left]) * (gx * gy) + _lanes(texels[upper + right]) * (fx * gy)
+    total += _lanes(texels[lower + left]) * (gx * fy) + _lanes(texels[lower + right]) * (fx * fy)
+    scale = 1.0 / (_STEPS * _STEPS)
     return (
-        wa * (a & 255) + wb * (b & 255) + wc * (c & 255) + wd * (d & 255),
-        wa * (a >> 8 & 255) + wb * (b >> 8 & 255) + wc * (c >> 8 & 255) + wd * (d >> 8 & 255),
-        wa * (a >> 16) + wb * (b >> 16) + wc * (c >> 16) + wd * (d >> 16),
+        (total & _LANE_MASK) * scale,
+        (total >> _LANE & _LANE_MASK) * scale,
+        (total >> 2 * _LANE) * scale,
     )
 
 
-@njit
+@kernel(forceinline=True)
 def sample(texels: I32, start: I64, m: int, u: float, v: float, lod: float) -> Vector:
-    """Colour 0..255 of material ``m`` at u, v repetitions; ``lod`` is log2 of the pixel's width in texels."""
+    """Colour 0..255 of material ``m`` at u, v repetitions; ``lod`` is log2 of the pixel's width in texels.
+
+    Two levels are mixed only in the middle half between them, which looks the same and costs less.
+    """
     lod = min(max(lod, 0.0), LEVELS - 1.001)
     level = int(lod)
-    share = lod - level
+    share = 2.0 * (lod - level) - 0.5
+    if share >= 1.0:
+        level += 1
     a = _bilinear(texels, start[m, level], SIZE >> level, u, v)
-    if share < 0.05:
+    if share <= 0.0 or share >= 1.0:
         return a[0], a[1], a[2]
     b = _bilinear(texels, start[m, level + 1], SIZE >> (level + 1), u, v)
     return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2])
 
 
-@njit
+@kernel(forceinline=True)
 def _slow(texels: I32, first: int, size: int, u: float, v: float) -> float:
     """Brightness 0..255 of the slow grey picture, bilinear."""
     x, y = u * size - 0.5, (1.0 - v) * size - 0.5
@@ -110,7 +153,7 @@ def _slow(texels: I32, first: int, size: int, u: float, v: float) -> float:
     return float((1 - fy) * high + fy * low)
 
 
-@njit
+@kernel(forceinline=True)
 def _sky(texels: I32, first: int, d0: float, d1: float, d2: float) -> Vector:
     """Linear light of the sky in a direction: haze at the horizon, blue above, clouds.
 
@@ -126,7 +169,7 @@ def _sky(texels: I32, first: int, d0: float, d1: float, d2: float) -> Vector:
     return r + cloud * (0.85 - r), g + cloud * (0.85 - g), b + cloud * (0.87 - b)
 
 
-@njit
+@kernel(forceinline=True)
 def _sunlit(depth: F32, rows: F32, x: float, y: float, z: float) -> float:
     """Share of sun 0..1 at a local point: four neighbours of the shadow map, weighted."""
     u = rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z + rows[0, 3]
@@ -148,158 +191,165 @@ def _sunlit(depth: F32, rows: F32, x: float, y: float, z: float) -> float:
     return lit
 
 
+@kernel(forceinline=True)
+def _turned(R: F64, x: float, y: float, z: float) -> Vector:
+    return (
+        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+    )
+
+
+@kernel(forceinline=True)
+def _part_of(first: I32, t: int) -> int:
+    part = 0
+    while part + 1 < len(first) and t >= first[part + 1]:
+        part += 1
+    return part
+
+
+@kernel(forceinline=True)
+def _paint(
+    surface: Surface, textures: TextureArrays, t: int, p: Vector, distance: float, wide: float, facing: float
+) -> Vector:
+    """Reflectance 0..~1, linear, of triangle ``t`` at its local point: picture, tint and slow changes."""
+    row, look = surface.rows[t], surface.look[t]
+    u = row[4] * p[0] + row[5] * p[1] + row[6] * p[2] + row[7]
+    v = row[8] * p[0] + row[9] * p[1] + row[10] * p[2] + row[11]
+    # width of the pixel on the surface: between its short and its long axis
+    lod = np.log2(max(distance * wide / np.sqrt(max(-facing, 0.02)), 1e-5))
+    r, g, b = sample(textures.texels, textures.start, look[3], u, v, lod + row[12])
+    level = int(min(max(lod + _SLOW_LOD, 0.0), LEVELS - 1.0))
+    first, size = textures.start[MACRO, level], SIZE >> level
+    slow = _slow(textures.texels, first, size, u * row[15] + row[13], v * row[15] + row[14])
+    k = slow / (_MACRO_MEAN * 255.0 * 255.0)
+    r, g, b = r * k * look[0], g * k * look[1], b * k * look[2]
+    return r * r, g * g, b * b
+
+
+@kernel(forceinline=True)
+def _reflected(
+    textures: TextureArrays, shine: float, light: Vector, n: Vector, d: Vector, facing: float
+) -> Vector:
+    """Light with mirrored sky (below the horizon a dark street) on a glossy material."""
+    rim = max(1.0 + facing, 0.0)
+    share = min(shine + (1.0 - shine) * rim * rim * rim * rim * rim, 0.5)  # Schlick 1994
+    e = -2.0 * facing
+    up = d[2] + e * n[2]
+    r, g, b = 0.10, 0.10, 0.10
+    if up > 0.0:
+        r, g, b = _sky(textures.texels, textures.start[MACRO, 1], d[0] + e * n[0], d[1] + e * n[1], up)
+    return (
+        light[0] + share * (r - light[0]),
+        light[1] + share * (g - light[1]),
+        light[2] + share * (b - light[2]),
+    )
+
+
+@kernel(forceinline=True)
+def _shade(
+    surface: Surface,
+    textures: TextureArrays,
+    shadow: ShadowMap,
+    parts: Parts,
+    t: int,
+    part: int,
+    x: float,
+    y: float,
+    wide: float,
+) -> tuple[Any, Any, Any, Any]:
+    """Linear light and depth along z where the line of sight (x, y, 1) meets triangle ``t`` of ``part``.
+
+    ``wide`` is the width of the pixel in radians.
+    """
+    inv = 1.0 / np.sqrt(x * x + y * y + 1.0)
+    d = _turned(parts.R_local_cam[part], x * inv, y * inv, inv)
+    if t < 0:
+        r, g, b = _sky(textures.texels, textures.start[MACRO, 1], d[0], d[1], d[2])
+        return r, g, b, np.inf
+    row, o = surface.rows[t], parts.eye[part]
+    facing = min(row[0] * d[0] + row[1] * d[1] + row[2] * d[2], -1e-4)
+    s = (row[3] - (row[0] * o[0] + row[1] * o[1] + row[2] * o[2])) / facing
+    p = (o[0] + s * d[0], o[1] + s * d[1], o[2] + s * d[2])
+    paint = _paint(surface, textures, t, p, s, wide, facing)
+    n = (row[0] + 0.0, row[1] + 0.0, row[2] + 0.0)
+    if part > 0:
+        R, shift = parts.R_scene_local[part], parts.t_scene_local[part]
+        n, d = _turned(R, n[0], n[1], n[2]), _turned(R, d[0], d[1], d[2])
+        q = _turned(R, p[0], p[1], p[2])
+        p = (q[0] + shift[0], q[1] + shift[1], q[2] + shift[2])
+    direct = max(n[0] * shadow.sun[0] + n[1] * shadow.sun[1] + n[2] * shadow.sun[2], 0.0)
+    if direct > 0.0:
+        direct *= _sunlit(shadow.depth, shadow.rows, p[0], p[1], p[2])
+    sky = 0.62 + 0.38 * n[2]
+    r = paint[0] * (_SUN[0] * direct + _SKY[0] * sky)
+    g = paint[1] * (_SUN[1] * direct + _SKY[1] * sky)
+    b = paint[2] * (_SUN[2] * direct + _SKY[2] * sky)
+    shine = textures.gloss[surface.look[t, 3]]
+    if shine > 0.0:
+        r, g, b = _reflected(textures, shine, (r, g, b), n, d, facing)
+    return r, g, b, s * inv
+
+
+@kernel(forceinline=True)
+def _one_surface(key: NDArray[np.uint32], a: int, b: int) -> bool:
+    return bool(a == b or (a >= 0 and b >= 0 and key[a] == key[b]))
+
+
+@kernel(forceinline=True)
+def _share_of(key: NDArray[np.uint32], ids: I32, four: I32, k: int) -> float:
+    """Share of a pixel that shows the surface of sub-pixel k; 0 where an earlier sub-pixel shows it, too."""
+    share = 0.25
+    for other in range(4):
+        if other != k and _one_surface(key, ids[four[k]], ids[four[other]]):
+            if other < k:
+                return 0.0
+            share += 0.25
+    return share
+
+
 @njit
-def _list_samples(ids: I32, canvas: I32, key: U32, pixel: I32, sub: U8, triangle: I32) -> int:
-    """What is to be shaded: a pixel's middle (sub 4) where its four sub-pixels see one surface, else each."""
-    count = 0
+def shade_pixels(
+    surface: Surface,
+    textures: TextureArrays,
+    shadow: ShadowMap,
+    parts: Parts,
+    ids: I32,
+    canvas: I32,
+    lines: F32,
+    wide: float,
+    film: Film,
+) -> None:
+    """Fill ``film``.
+
+    ``ids`` triangle numbers of a flat canvas; ``canvas`` int32 (n, 4) where on it each pixel's four sub-pixels
+    lie; ``lines`` float32 (n, 5, 2) their lines of sight x/z, y/z, the fifth that of the pixel's middle. A
+    pixel is shaded once, at its middle, where its sub-pixels see one surface, else once for each surface.
+    """
     for i in range(len(canvas)):
         first = ids[canvas[i, 0]]
         same = True
         for k in range(1, 4):
-            t = ids[canvas[i, k]]
-            same = same and (t == first or (t >= 0 and first >= 0 and key[t] == key[first]))
+            same = same and _one_surface(surface.key, first, ids[canvas[i, k]])
         if same:
-            pixel[count], sub[count], triangle[count] = i, 4, first
-            count += 1
+            part = _part_of(parts.first, first)
+            x, y = lines[i, 4, 0], lines[i, 4, 1]
+            r, g, b, z = _shade(surface, textures, shadow, parts, first, part, x, y, wide)
+            film.light[i, 0], film.light[i, 1], film.light[i, 2] = r, g, b
+            film.depth[i], film.part[i] = z, part
             continue
+        film.light[i, 0] = film.light[i, 1] = film.light[i, 2] = 0.0
+        film.depth[i], film.part[i] = np.inf, 0
         for k in range(4):
-            pixel[count], sub[count], triangle[count] = i, k, ids[canvas[i, k]]
-            count += 1
-    return count
-
-
-@njit
-def _geometry(
-    pixel: I32,
-    sub: U8,
-    triangle: I32,
-    lines: F32,
-    R: F64,
-    o: F64,
-    width: float,
-    rows: F32,
-    ray: F32,
-    point: F32,
-    texture: F32,
-) -> None:
-    """Per sample: ``ray`` direction and cosine to the surface; ``point`` local position; ``texture`` u, v and
-    lod of the picture, u, v of the slow picture and its lod.
-    """
-    for i in range(len(pixel)):
-        x, y = lines[pixel[i], sub[i], 0], lines[pixel[i], sub[i], 1]
-        inv = 1.0 / np.sqrt(x * x + y * y + 1.0)
-        d0 = (R[0, 0] * x + R[0, 1] * y + R[0, 2]) * inv
-        d1 = (R[1, 0] * x + R[1, 1] * y + R[1, 2]) * inv
-        d2 = (R[2, 0] * x + R[2, 1] * y + R[2, 2]) * inv
-        ray[i, 0], ray[i, 1], ray[i, 2] = d0, d1, d2
-        if triangle[i] < 0:
-            continue
-        row = rows[triangle[i]]
-        facing = row[0] * d0 + row[1] * d1 + row[2] * d2
-        s = (row[3] - (row[0] * o[0] + row[1] * o[1] + row[2] * o[2])) / min(facing, -1e-4)
-        p0, p1, p2 = o[0] + s * d0, o[1] + s * d1, o[2] + s * d2
-        u = row[4] * p0 + row[5] * p1 + row[6] * p2 + row[7]
-        v = row[8] * p0 + row[9] * p1 + row[10] * p2 + row[11]
-        # width of the pixel on the surface: between its short and its long axis
-        wide = s * (width if sub[i] == 4 else 0.5 * width) / np.sqrt(max(-facing, 0.02))
-        lod = np.log2(max(wide, 1e-5))
-        ray[i, 3] = facing
-        point[i, 0], point[i, 1], point[i, 2] = p0, p1, p2
-        texture[i, 0], texture[i, 1], texture[i, 2] = u, v, lod + row[12]
-        texture[i, 3], texture[i, 4] = u * row[15] + row[13], v * row[15] + row[14]
-        texture[i, 5] = lod + _SLOW_LOD
-
-
-@njit
-def _paint(triangle: I32, look: U8, texture: F32, texels: I32, start: I64, light: F32) -> None:
-    """Reflectance 0..~1 of the samples, linear: picture, tint and slow changes of brightness."""
-    for i in range(len(triangle)):
-        t = triangle[i]
-        if t < 0:
-            continue
-        r, g, b = sample(texels, start, look[t, 3], texture[i, 0], texture[i, 1], texture[i, 2])
-        level = int(min(max(texture[i, 5], 0.0), LEVELS - 1.0))
-        slow = _slow(texels, start[MACRO, level], SIZE >> level, texture[i, 3], texture[i, 4])
-        k = slow / (_MACRO_MEAN * 255.0 * 255.0)
-        r, g, b = r * k * look[t, 0], g * k * look[t, 1], b * k * look[t, 2]
-        light[i, 0], light[i, 1], light[i, 2] = r * r, g * g, b * b
-
-
-@njit
-def _illuminate(
-    triangle: I32, rows: F32, point: F32, depth: F32, sun_rows: F32, sun: F32, light: F32
-) -> None:
-    """Multiply the reflectance by the light that arrives: sun where its map sees the point, and sky."""
-    for i in range(len(triangle)):
-        if triangle[i] < 0:
-            continue
-        row = rows[triangle[i]]
-        direct = max(row[0] * sun[0] + row[1] * sun[1] + row[2] * sun[2], 0.0)
-        if direct > 0.0:
-            direct *= _sunlit(depth, sun_rows, point[i, 0], point[i, 1], point[i, 2])
-        sky = 0.62 + 0.38 * row[2]
-        light[i, 0] *= _SUN[0] * direct + _SKY[0] * sky
-        light[i, 1] *= _SUN[1] * direct + _SKY[1] * sky
-        light[i, 2] *= _SUN[2] * direct + _SKY[2] * sky
-
-
-@njit
-def _mirror(
-    triangle: I32, look: U8, rows: F32, ray: F32, gloss: F32, texels: I32, clouds: int, light: F32
-) -> None:
-    """Sky where nothing was met, and mirrored sky (below the horizon a dark street) on glossy materials."""
-    for i in range(len(triangle)):
-        d0, d1, d2 = ray[i, 0], ray[i, 1], ray[i, 2]
-        if triangle[i] < 0:
-            light[i, 0], light[i, 1], light[i, 2] = _sky(texels, clouds, d0, d1, d2)
-            continue
-        shine = gloss[look[triangle[i], 3]]
-        if shine == 0.0:
-            continue
-        row, facing = rows[triangle[i]], ray[i, 3]
-        rim = max(1.0 + facing, 0.0)
-        share = min(shine + (1.0 - shine) * rim * rim * rim * rim * rim, 0.5)  # Schlick 1994
-        e = -2.0 * facing
-        up = d2 + e * row[2]
-        r, g, b = 0.10, 0.10, 0.10
-        if up > 0.0:
-            r, g, b = _sky(texels, clouds, d0 + e * row[0], d1 + e * row[1], up)
-        light[i, 0] += share * (r - light[i, 0])
-        light[i, 1] += share * (g - light[i, 1])
-        light[i, 2] += share * (b - light[i, 2])
-
-
-@njit
-def _gather(pixel: I32, sub: U8, light: F32, out: F32) -> None:
-    """Mean of each pixel's samples."""
-    for i in range(len(pixel)):
-        weight = 1.0 if sub[i] == 4 else 0.25
-        for a in range(3):
-            out[pixel[i], a] += weight * light[i, a]
-
-
-def shade_image(
-    scene: Scene, shadow: ShadowMap, ids: I32, lines: F32, canvas: I32, T_world_cam: F64, pixel: float
-) -> F32:
-    """Linear light float32 (h, w, 3).
-
-    ``ids`` triangle numbers of a canvas; ``canvas`` int32 (h, w, 4) flat canvas index of each pixel's four
-    sub-pixels; ``lines`` float32 (h, w, 5, 2) their lines of sight x/z, y/z, the fifth that of the pixel's
-    middle; ``pixel`` its width in radians.
-    """
-    height, width = canvas.shape[:2]
-    surface, textures = scene.surface, scene.atlas.arrays
-    number, sub, triangle = (np.empty(4 * height * width, kind) for kind in (np.int32, np.uint8, np.int32))
-    count = _list_samples(ids.reshape(-1), canvas.reshape(-1, 4), surface.key, number, sub, triangle)
-    number, sub, triangle = number[:count], sub[:count], triangle[:count]
-    ray, point, texture = (np.empty((count, k), np.float32) for k in (4, 3, 6))
-    o, R = T_world_cam[:3, 3] - scene.origin, np.ascontiguousarray(T_world_cam[:3, :3])
-    _geometry(number, sub, triangle, lines.reshape(-1, 5, 2), R, o, pixel, surface.rows, ray, point, texture)
-    light = np.empty((count, 3), np.float32)
-    _paint(triangle, surface.look, texture, textures.texels, textures.start, light)
-    _illuminate(triangle, surface.rows, point, shadow.depth, shadow.rows, shadow.sun, light)
-    clouds = int(textures.start[MACRO, 1])
-    _mirror(triangle, surface.look, surface.rows, ray, textures.gloss, textures.texels, clouds, light)
-    out = np.zeros((height * width, 3), np.float32)
-    _gather(number, sub, light, out)
-    return out.reshape(height, width, 3)
+            t = ids[canvas[i, k]]
+            weight = _share_of(surface.key, ids, canvas[i], k)
+            if weight == 0.0:
+                continue
+            part = _part_of(parts.first, t)
+            x, y = lines[i, k, 0], lines[i, k, 1]
+            r, g, b, z = _shade(surface, textures, shadow, parts, t, part, x, y, 0.7 * wide)
+            film.light[i, 0] += weight * r
+            film.light[i, 1] += weight * g
+            film.light[i, 2] += weight * b
+            if z < film.depth[i]:
+                film.depth[i], film.part[i] = z, part
