@@ -1,27 +1,32 @@
-"""Scan pattern of the Livox Avia: a rosette of two counter-rotating prisms, six lasers, never repeating.
+"""Scan pattern of the Livox Avia: six lasers behind three rotating prisms, a rosette that does not repeat.
 
-Known of the Avia: field of view 70.4 x 77.2 degrees in non-repetitive mode, 240 000 points/s, six lasers
-fired in turn, frames of 100 ms (user manual; Livox SDK 1: line = point number modulo 6). Two equal prisms
-deflect a beam within a circle; we take its diameter as 70.4 degrees and spread the six lasers vertically over
-the missing 6.8 degrees. The prisms' rates are those published for the Mid-40 of the same maker, 7294 and
--4664 rpm (Brazeal, Wilkinson & Hochmair, "A Rigorous Observation Model for the Risley Prism-Based Livox
-Mid-40 Lidar Sensor", Sensors 21(14), 2021); the Avia's own are not published.
+Published: field of view 70.4 x 77.2 degrees in non-repetitive mode, 240 000 points/s, frames of 100 ms
+(livoxtech.com/avia/specs as quoted by public projects); six lasers fired in turn, so that the line is the
+point's number modulo 6 (Livox SDK 1 and its ROS driver). Not published by Livox: the optics. Wedges, rates and
+refractive index are those in the tests of PlantSimulationLab/Phytograph (backend, Livox rosette), which takes
+its other scanners from HELIOS++; through them one laser fills a circle of 70.42 degrees, which confirms them.
+That the six lasers differ in elevation only, evenly and by as much as makes the field 77.2 degrees high, is our
+assumption.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from artemis_drivers.virtual.lidar import Beams
+from artemis_drivers.virtual.lidar import Beams, LidarSpec, Sensor
 from artemis_drivers.virtual.mesh_builder import F64
+from artemis_drivers.virtual.prisms import deflect
 
 POINTS_PER_SECOND = 240_000
 FRAME_S = 0.1
 LINES = 6
 FOV_HORIZONTAL = 70.4 * np.pi / 180
 FOV_VERTICAL = 77.2 * np.pi / 180
-_RATE_1_HZ = 7294.0 / 60.0
-_RATE_2_HZ = -4664.0 / 60.0
+_WEDGE = np.radians([30.8856, 29.7735, 3.1351])
+_RATE_HZ = np.array([-131.5463, 40.8032, 213.1611])
+_INDEX = 1.51
+# elevation of the outer lasers before the prisms: with it the field is 77.2 degrees high behind them
+_OUTER = 3.08 * np.pi / 180
 
 
 def beams(frame: int, density: float = 1.0) -> Beams:
@@ -38,14 +43,11 @@ def beams(frame: int, density: float = 1.0) -> Beams:
 
 def direction(time_s: F64, line: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> F64:
     """Unit directions (n, 3) in the LiDAR's frame, x forward, y left, z up, of laser ``line`` at a time."""
-    prism = FOV_HORIZONTAL / 4  # deflection of one prism
-    a, b = 2 * np.pi * _RATE_1_HZ * time_s, 2 * np.pi * _RATE_2_HZ * time_s
-    left = prism * (np.cos(a) + np.cos(b))
-    up = prism * (np.sin(a) + np.sin(b))
-    angle = np.hypot(left, up)
-    sine = np.sinc(angle / np.pi)  # sin(angle) / angle
-    x, y, z = np.cos(angle), left * sine, up * sine
-    # each laser's own elevation, added after the prisms
-    tilt = (FOV_VERTICAL - FOV_HORIZONTAL) * (line / (LINES - 1) - 0.5)
-    c, s = np.cos(tilt), np.sin(tilt)
-    return np.column_stack([c * x - s * z, y, s * x + c * z])
+    elevation = _OUTER * (2 * np.arange(LINES) / (LINES - 1) - 1)
+    laser = np.column_stack([np.cos(elevation), np.zeros(LINES), np.sin(elevation)])
+    out = np.empty((len(time_s), 3))
+    deflect(_WEDGE, _RATE_HZ, _INDEX, laser, line, np.asarray(time_s, np.float64), out)
+    return out
+
+
+SENSOR = Sensor("Livox Avia", beams, LidarSpec(), POINTS_PER_SECOND, LINES)

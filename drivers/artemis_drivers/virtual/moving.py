@@ -83,8 +83,10 @@ def into_mover(part: MovingPart, origin: F64, direction: F64, time_s: F64) -> tu
     return np.einsum("nji,nj->ni", R, origin - T[:, :3, 3]), np.einsum("nji,nj->ni", R, direction)
 
 
-def near_mover(part: MovingPart, origin: F64, direction: F64, time_s: F64, limit: F64) -> I32:
-    """Rows of the rays that pass a mover's bounding sphere before ``limit`` metres (a few too many)."""
+def near_mover(
+    part: MovingPart, origin: F64, direction: F64, time_s: F64, limit: F64, slack_m: float = 1e-3
+) -> I32:
+    """Rows of the rays that pass a mover's bounding sphere, grown by ``slack_m``, before ``limit`` metres."""
     out = np.empty(len(origin), np.int32)
     finite = time_s[np.isfinite(time_s)]
     if len(finite) == 0:
@@ -93,7 +95,7 @@ def near_mover(part: MovingPart, origin: F64, direction: F64, time_s: F64, limit
     knots = int(np.ceil((stop - start) / _KNOT_S)) + 1
     centre = part.pose(np.linspace(start, stop, knots))[:, :3, 3]
     step = (stop - start) / max(knots - 1, 1)
-    radius = part.radius + (_KNOT_SLACK_M if knots > 1 else 1e-3)
+    radius = part.radius + slack_m + (_KNOT_SLACK_M if knots > 1 else 0.0)
     return out[: _near_sphere(origin, direction, time_s, limit, centre, start, step, radius, out)]
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_drivers._jit import njit
+from artemis_drivers._jit import kernel, njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32
 
 Vector = tuple[Any, Any, Any]  # float32 scalars of a kernel
@@ -231,7 +231,7 @@ def _build(low: F32, high: F32, order: I32) -> tuple[F32, I32, int]:
     return boxes, child, nodes
 
 
-@njit
+@kernel
 def _enter(b: F32, first: int, o: Vector, inv: Vector, limit: Any) -> Any:
     """Distance at which the ray enters a child's box, inf when it misses."""
     x0, x1 = (b[first] - o[0]) * inv[0], (b[first + 3] - o[0]) * inv[0]
@@ -243,8 +243,8 @@ def _enter(b: F32, first: int, o: Vector, inv: Vector, limit: Any) -> Any:
     return near if near <= far * _SLACK else _FINF
 
 
-@njit
-def _inverse(d: Any) -> Any:
+@kernel
+def inverse(d: Any) -> Any:
     """1 / d, bounded: with an infinity the box test would compute 0 * inf."""
     return _F1 / d if abs(d) > np.float32(1e-12) else np.float32(1e12)
 
@@ -266,7 +266,7 @@ def _cast(
     for r in range(len(origin)):
         o = (origin[r, 0], origin[r, 1], origin[r, 2])
         d = (direction[r, 0], direction[r, 1], direction[r, 2])
-        inv = (_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
+        inv = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
         best, hit, hit_u, hit_v = limit[r], -1, _F0, _F0
         depth = 1
         stack[0], entry[0] = 0, _F0
@@ -311,13 +311,13 @@ def _first_free_line(bvh: Bvh, points: F64, eyes: F64, tries: I32, slack: float,
             length = np.sqrt(dx * dx + dy * dy + dz * dz)
             o = (np.float32(eyes[eye, 0]), np.float32(eyes[eye, 1]), np.float32(eyes[eye, 2]))
             d = (np.float32(dx / length), np.float32(dy / length), np.float32(dz / length))
-            inv = (_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
+            inv = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
             if not _blocked(bvh, o, d, inv, np.float32(length - slack), stack):
                 out[i] = k
                 break
 
 
-@njit
+@kernel
 def _blocked(bvh: Bvh, o: Vector, d: Vector, inv: Vector, limit: float, stack: I32) -> bool:
     """Whether any triangle lies nearer than ``limit`` along the ray."""
     boxes, child, corner = bvh.boxes, bvh.child, bvh.corner
@@ -346,7 +346,7 @@ def _blocked(bvh: Bvh, o: Vector, d: Vector, inv: Vector, limit: float, stack: I
     return False
 
 
-@njit
+@kernel
 def _meet(c: F32, o: Vector, d: Vector) -> Vector:
     """Distance and barycentric u, v where the ray meets a row of Bvh.corner; inf when it does not."""
     px = d[1] * c[8] - d[2] * c[7]

@@ -41,7 +41,8 @@ class Scene:
     ``mesh``, ``bvh``, ``object_of``, ``object_centre`` and ``object_radius`` are of what stands still;
     ``surface``, ``class_id`` uint8 and ``instance`` int32 have a row for every triangle, those of ``movers``
     behind. ``object_of`` int32 (m,) numbers the objects 0..k - 1 of the triangles; ``object_centre`` float64
-    (k, 3), local, and ``object_radius`` (k,) enclose them.
+    (k, 3), local, and ``object_radius`` (k,) enclose them. ``panes`` marks the triangles that let a LiDAR's
+    beam pass, one array for what stands still and one for each mover, in the order of their ``bvh``.
     """
 
     mesh: WorldMesh
@@ -54,6 +55,7 @@ class Scene:
     movers: tuple[MovingPart, ...]
     class_id: U8
     instance: I32
+    panes: tuple[NDArray[np.bool_], ...]
 
     @property
     def origin(self) -> F64:
@@ -79,6 +81,10 @@ def _assemble(mesh: WorldMesh, atlas: TextureAtlas, movers: tuple[MovingPart, ..
         movers,
         np.concatenate([part.class_id for part, _ in parts]),
         np.concatenate([part.instance for part, _ in parts]),
+        tuple(
+            atlas.arrays.glass[part.material[tree.order]]
+            for part, tree in [(mesh, bvh), *((m.mesh, m.bvh) for m in movers)]
+        ),
     )
 
 
