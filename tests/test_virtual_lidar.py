@@ -9,7 +9,7 @@ import pytest
 from artemis_drivers.virtual import avia, mid360, street
 from artemis_drivers.virtual.echo import Receiver, empty_echoes, receive, seen_m
 from artemis_drivers.virtual.footprint import LANES, Spots, fan_out, lane_offsets
-from artemis_drivers.virtual.lidar import Beams, Frame, LidarSpec, poses_at, range_sigma, scan
+from artemis_drivers.virtual.lidar import Beams, Frame, LidarSpec, _jittered, poses_at, range_sigma, scan
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder, WorldMesh
 from artemis_drivers.virtual.motion import Motion, rotation
 from artemis_drivers.virtual.moving import near_mover
@@ -220,7 +220,7 @@ def test_spots_of_no_beams_and_of_broken_beams(busy: Scene) -> None:
         busy, np.empty((0, 3)), np.empty((0, 3, 8), np.float32), np.empty(0), 50.0
     ).distance.shape == (0, 8)
     fan = np.tile(np.array([1.0, 0, 0], np.float32)[:, None], (3, 1, 8))
-    fan[1, 0, 3] = np.nan
+    fan[1] = np.nan
     spots = Spots(busy, np.zeros((3, 3)), fan, np.array([0.0, 0.0, np.nan]), 50.0)
     assert (spots.triangle[0] >= 0).all() and (spots.triangle[1:] == -1).all()
     assert np.isinf(spots.distance[1:]).all()
@@ -485,6 +485,21 @@ def test_movers_are_met_where_they_are(atlas: TextureAtlas) -> None:
     front = frame.points[on_it, 0] < 7.51
     assert np.abs(offset).max() < 2.001 and front.mean() > 0.9
     assert offset[front].max() > 1.9 and offset[front].min() < -1.9
+
+
+def test_direction_noise_turns_across_the_beam() -> None:
+    rng = np.random.default_rng(5)
+    direction = rng.normal(size=(300, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction[0] = 0, 0, 1
+    angle = rng.normal(0, 0.01, (300, 2))
+    turned = _jittered(direction, angle)
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1.0)
+    away = np.arccos(np.clip((turned * direction).sum(axis=1), -1, 1))
+    np.testing.assert_allclose(away, np.arctan(np.hypot(*angle.T)), atol=1e-7)
+    up = _jittered(direction, np.column_stack([0 * angle[:, 1], angle[:, 1]]))[1:]
+    lifted = np.arcsin(up[:, 2]) - np.arcsin(direction[1:, 2])
+    np.testing.assert_allclose(lifted, np.arctan(angle[1:, 1]), atol=1e-6)
 
 
 def test_poses_between_knots_are_those_of_the_motion() -> None:

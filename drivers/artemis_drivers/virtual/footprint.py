@@ -63,7 +63,8 @@ class Spots:
 
     def __init__(self, scene: Scene, origin: F64, fan: F32, time_s: F64, max_range_m: float) -> None:
         n, lanes = len(origin), fan.shape[2]
-        usable = np.isfinite(origin).all(axis=1) & np.isfinite(fan).all(axis=(1, 2)) & np.isfinite(time_s)
+        # a beam that is not finite has no finite lane
+        usable = np.isfinite(origin).all(axis=1) & np.isfinite(fan[:, :, 0]).all(axis=1) & np.isfinite(time_s)
         self.origin = np.where(usable[:, None], origin, 0.0)
         self.fan = fan if usable.all() else np.where(usable[:, None, None], fan, np.float32(0))
         self.distance = np.full((n, lanes), max_range_m, np.float32)
@@ -81,7 +82,7 @@ class Spots:
         cast_fans(scene.bvh, scene.panes[0], 0, everyone, local, self.fan, self.distance, self.triangle)
         if scene.movers:
             # a spot is wider than its axis, by less than a metre wherever a mover is of interest
-            reach, axis = self.distance.max(axis=1).astype(np.float64), _axes(self.fan)
+            reach, axis = _farthest(self.distance), _axes(self.fan)
         for mover, panes in zip(scene.movers, scene.panes[1:], strict=True):
             rows = near_mover(mover, self.origin, axis, time_s, reach, slack_m=1.0)
             if len(rows) == 0:
@@ -111,6 +112,31 @@ class Spots:
 def _axes(fan: F32) -> F64:
     """A lane next to the middle of each spot, unit (n, 3)."""
     return np.ascontiguousarray(fan[:, :, fan.shape[2] // 2], np.float64)
+
+
+@_vector
+def _greatest(values: F32) -> Any:
+    out = values[0]
+    for k in range(1, len(values)):
+        out = max(out, values[k])
+    return out
+
+
+@_vector
+def _least(values: F32) -> Any:
+    out = values[0]
+    for k in range(1, len(values)):
+        out = min(out, values[k])
+    return out
+
+
+@njit
+def _farthest(distance: F32) -> F64:
+    """Greatest distance of each beam's lanes."""
+    out = np.empty(len(distance))
+    for i in range(len(distance)):
+        out[i] = _greatest(distance[i])
+    return out
 
 
 @njit
@@ -205,22 +231,6 @@ def _mirrors(c: F32, fan: F32) -> bool:
     nx, ny, nz = c[4] * c[8] - c[5] * c[7], c[5] * c[6] - c[3] * c[8], c[3] * c[7] - c[4] * c[6]
     facing = nx * fan[0, 0] + ny * fan[1, 0] + nz * fan[2, 0]
     return bool(facing * facing > (GLINT_COSINE * GLINT_COSINE) * (nx * nx + ny * ny + nz * nz))
-
-
-@_vector
-def _greatest(values: F32) -> Any:
-    out = values[0]
-    for k in range(1, len(values)):
-        out = max(out, values[k])
-    return out
-
-
-@_vector
-def _least(values: F32) -> Any:
-    out = values[0]
-    for k in range(1, len(values)):
-        out = min(out, values[k])
-    return out
 
 
 @njit

@@ -218,9 +218,19 @@ def _between(T: F64, time: F64, step: float, origin: F64, R: F64) -> None:
 
 
 def _jittered(direction: F64, angle: F64) -> F64:
-    """Unit directions turned by small angles (n, 2) about two axes across them."""
-    across = np.column_stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))])
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-    up = np.cross(direction, across)
-    turned = direction + angle[:, :1] * across + angle[:, 1:] * up
-    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+    """Unit directions turned by small angles (n, 2) across them, horizontally and vertically."""
+    out = np.empty(direction.shape)
+    _turn(direction, angle, out)
+    return out
+
+
+@njit
+def _turn(direction: F64, angle: F64, out: F64) -> None:
+    for i in range(len(direction)):
+        x, y, z = direction[i, 0], direction[i, 1], direction[i, 2]
+        flat = np.sqrt(x * x + y * y)
+        hx, hy = (-y / flat, x / flat) if flat > 1e-9 else (0.0, 1.0)
+        side, up = angle[i, 0], angle[i, 1]
+        tx, ty, tz = x + side * hx - up * z * hy, y + side * hy + up * z * hx, z + up * (x * hy - y * hx)
+        scale = 1.0 / np.sqrt(tx * tx + ty * ty + tz * tz)
+        out[i, 0], out[i, 1], out[i, 2] = tx * scale, ty * scale, tz * scale

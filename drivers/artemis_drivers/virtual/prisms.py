@@ -23,12 +23,12 @@ def deflect(
     ``wedge`` radians and ``rate`` turns per second of each prism in the order that light passes them; ``laser``
     (lasers, 3) unit directions before the prisms and ``which`` (n,) the one that fired at ``time`` (n,) s.
     """
+    tilt, straight = np.sin(wedge), np.cos(wedge)
     for i in range(len(time)):
         d = (laser[which[i], 0], laser[which[i], 1], laser[which[i], 2])
         for p in range(len(wedge)):
             angle = 2 * np.pi * rate[p] * time[i]
-            tilt = np.sin(wedge[p])
-            face = (-np.cos(wedge[p]), -tilt * np.cos(angle), -tilt * np.sin(angle))
+            face = (-straight[p], -tilt[p] * np.cos(angle), -tilt[p] * np.sin(angle))
             d = refract(d, face, 1.0 / index)
             d = refract(d, (-1.0, 0.0, 0.0), index)
         out[i, 0], out[i, 1], out[i, 2] = d
