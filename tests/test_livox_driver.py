@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from artemis_drivers.base import DriverError, Health, State
 from artemis_drivers.livox_avia.control import AviaSession
-from artemis_drivers.livox_avia.driver import avia_driver, spread_ports
+from artemis_drivers.livox_avia.driver import spread_ports
 from artemis_drivers.livox_avia.protocol import Lidar, WorkState
 from artemis_drivers.livox_avia.settings import AviaConfig, StoredExtrinsic
 from artemis_drivers.livox_host import LivoxHost
+from artemis_drivers.livox_mid360.driver import livox_driver
 from artemis_drivers.livox_slots import collect
 from artemis_drivers.ring import RingReader
 from artemis_drivers.udp import Interface, interfaces, open_udp, port_holder, receive_buffer_warning
@@ -37,7 +38,7 @@ def until(condition: Callable[[], bool], seconds: float = 6.0) -> bool:
 @contextmanager
 def rig(device: VirtualAvia, config: AviaConfig | None = None) -> Iterator[LivoxHost]:
     """A virtual device and a driver that has reached RUNNING."""
-    driver = avia_driver([config or AviaConfig()])
+    driver = livox_driver([config or AviaConfig()])
     with device:
         driver.start()
         try:
@@ -128,7 +129,7 @@ def test_other_data_types_on_the_wire(mode: str, coordinate: str, data_type: int
 
 def test_lost_doubled_and_packed_replies() -> None:
     device = quick(faults=Faults(seed=3, lose_replies=0.2, duplicate_replies=0.3))
-    driver = avia_driver([AviaConfig()])
+    driver = livox_driver([AviaConfig()])
     with device:
         driver.start()
         try:
@@ -142,7 +143,7 @@ def test_lost_doubled_and_packed_replies() -> None:
 
 def test_two_replies_in_one_datagram() -> None:
     device = quick(faults=Faults(seed=2, pack_replies=0.4))
-    driver = avia_driver([AviaConfig(imu=False)])
+    driver = livox_driver([AviaConfig(imu=False)])
     with device:
         driver.start()
         try:
@@ -184,7 +185,7 @@ def test_refused_setting_is_reported() -> None:
 
 def test_start_up_progress_and_standby() -> None:
     device = quick(boot_s=1.2)
-    driver = avia_driver([AviaConfig()])
+    driver = livox_driver([AviaConfig()])
     with device:
         device._mode = WorkState.STANDBY
         driver.start()
@@ -305,7 +306,7 @@ def test_two_lidars_by_configuration() -> None:
             )
             for k in range(2)
         ]
-        driver = avia_driver(
+        driver = livox_driver(
             [AviaConfig(name="any"), AviaConfig(name="front", broadcast_code="3JEDK1E000F636")]
         )
         driver.start()
@@ -336,11 +337,11 @@ def test_packets_of_a_stranger_are_not_taken() -> None:
 
 def test_port_in_use_names_the_holder() -> None:
     with open_udp(55000), pytest.raises(DriverError) as caught:
-        avia_driver([AviaConfig()]).start()
+        livox_driver([AviaConfig()]).start()
     text = str(caught.value)
     assert "UDP port 55000" in text and f"process {os.getpid()}" in text and "stop that program" in text
     with open_udp(56001), pytest.raises(DriverError, match="56001"):
-        avia_driver([AviaConfig()]).start()
+        livox_driver([AviaConfig()]).start()
     with open_udp(55000):  # the failed start has left nothing open
         pass
     assert port_holder(1) == "an unknown process"
@@ -348,7 +349,7 @@ def test_port_in_use_names_the_holder() -> None:
 
 def test_wrong_subnet() -> None:
     other = [Interface("eth0", IPv4Address("192.168.7.2"), IPv4Network("192.168.7.0/24"))]
-    driver = avia_driver([AviaConfig()], lambda: other)
+    driver = livox_driver([AviaConfig()], own_addresses=lambda: other)
     with quick():
         driver.start()
         try:
@@ -362,7 +363,7 @@ def test_wrong_host_address_and_wrong_serial() -> None:
     with pytest.raises(DriverError, match="no address of this computer"):
         open_udp(0, "203.0.113.9")
     with pytest.raises(DriverError, match="same name"):
-        avia_driver([AviaConfig(), AviaConfig()])
+        livox_driver([AviaConfig(), AviaConfig()])
     session = AviaSession(AviaConfig(broadcast_code="OTHER"))
     session.start(0)
     session.tick(6 * SECOND)
@@ -429,7 +430,7 @@ def test_ports_of_several_lidars() -> None:
 
 
 def test_stop_without_device_and_twice() -> None:
-    driver = avia_driver([AviaConfig()])
+    driver = livox_driver([AviaConfig()])
     driver.start()
     assert one(driver).state == State.SEARCHING
     driver.stop()

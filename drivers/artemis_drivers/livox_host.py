@@ -70,9 +70,9 @@ class Finder(Protocol):
 
 
 class Ports(NamedTuple):
-    """Own UDP ports of one LiDAR: commands, and one or more for data."""
+    """Own UDP ports of one LiDAR: for control (the first one sends), and for data."""
 
-    command: int
+    control: tuple[int, ...]
     data: tuple[int, ...]
 
 
@@ -85,14 +85,17 @@ class LivoxLidar:
         self.points, self.imu = decoder.points, decoder.imu
         self.warning = ""
         self._utc: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self._command: socket.socket | None = None
+        self._control: list[socket.socket] = []
         self._receivers: list[PacketReceiver] = []
         self._last_data = 0
 
     def open(self) -> None:
         """Open the sockets. Raises DriverError when a port is taken."""
         self.decoder.warm_up()
-        self._command = open_udp(self.ports.command)
+        self._control.clear()
+        self._receivers.clear()
+        for port in self.ports.control:
+            self._control.append(open_udp(port))
         for port in self.ports.data:
             sock = open_udp(port, receive_buffer=RECEIVE_BUFFER)
             self.warning = receive_buffer_warning(sock)
@@ -100,9 +103,8 @@ class LivoxLidar:
 
     def close(self) -> None:
         """Close the sockets; the counters stay readable."""
-        for sock in [self._command, *(r.sock for r in self._receivers)]:
-            if sock is not None:
-                sock.close()
+        for sock in [*self._control, *(r.sock for r in self._receivers)]:
+            sock.close()
 
     def send_utc(self, unix_ns: int) -> None:
         """Ask that the PPS edge just passed be named ``unix_ns``; callable from any thread."""
@@ -127,14 +129,13 @@ class LivoxLidar:
 
     def converse(self, now: int) -> None:
         """Let the session hear, think and speak."""
-        if self._command is None:
-            return
-        for datagram, ip in _waiting(self._command):
-            self.session.hear(datagram, ip, now)
+        for sock in self._control:
+            for datagram, ip in _waiting(sock):
+                self.session.hear(datagram, ip, now)
         with contextlib.suppress(queue.Empty):
             self.session.send_utc(self._utc.get_nowait())
         self.session.tick(now)
-        _send(self._command, self.session.outbox, self.session.counters)
+        _send(self._control[0], self.session.outbox, self.session.counters)
         self.session.outbox.clear()
 
     def health(self) -> Health:
@@ -234,6 +235,18 @@ class LivoxHost:
         self._sockets.clear()
         for lidar in self.lidars:
             lidar.close()
+
+
+def check_lidars(lidars: Sequence[LivoxLidar]) -> None:
+    """Raises DriverError when two LiDARs share a name or a port."""
+    names = Counter(lidar.name for lidar in lidars)
+    ports = Counter(port for lidar in lidars for port in (*lidar.ports.control, *lidar.ports.data))
+    for name, count in names.items():
+        if count > 1:
+            raise DriverError(f"{count} LiDARs have the same name {name}: give each its own")
+    for port, count in ports.items():
+        if count > 1:
+            raise DriverError(f"{count} LiDARs use the same UDP port {port}: give each its own")
 
 
 def packet_ring() -> Ring:

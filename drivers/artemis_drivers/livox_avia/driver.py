@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from artemis_drivers.base import DriverError
 from artemis_drivers.livox_avia.control import AviaSession
 from artemis_drivers.livox_avia.payloads import Broadcast
 from artemis_drivers.livox_avia.points import Decoder
 from artemis_drivers.livox_avia.protocol import DISCOVERY_PORT, General, Kind, decode
 from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.livox_dialogue import Datagram
-from artemis_drivers.livox_host import LivoxHost, LivoxLidar, Ports, packet_ring
+from artemis_drivers.livox_host import LivoxLidar, Ports, packet_ring
 from artemis_drivers.udp import Interface, interfaces
 
 
@@ -50,19 +49,8 @@ def avia_lidar(
 ) -> tuple[LivoxLidar, AviaSession]:
     """One Avia for a LivoxHost, and its session for the AviaFinder."""
     session, packets = AviaSession(config, own_addresses), packet_ring()
-    ports = Ports(config.command_port, (config.data_port,))
+    ports = Ports((config.command_port,), (config.data_port,))
     return LivoxLidar(config.name, ports, session, packets, Decoder(packets)), session
-
-
-def avia_driver(
-    configs: Sequence[AviaConfig], own_addresses: Callable[[], list[Interface]] = interfaces
-) -> LivoxHost:
-    """Driver of the Avias of a rig. Raises DriverError when two configurations contradict each other."""
-    configs = spread_ports(configs)
-    if len({c.name for c in configs}) < len(configs):
-        raise DriverError("two LiDARs have the same name: give each its own")
-    pairs = [avia_lidar(config, own_addresses) for config in configs]
-    return LivoxHost([lidar for lidar, _ in pairs], [AviaFinder([session for _, session in pairs])])
 
 
 def spread_ports(configs: Sequence[AviaConfig]) -> list[AviaConfig]:

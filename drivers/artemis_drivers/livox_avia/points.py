@@ -7,27 +7,22 @@ metres. Point i was fired by laser (shot mod 6) at the packet's time + shot x 4.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from artemis_drivers._jit import njit
+from artemis_drivers.livox_bytes import f32_at, i32_at, u16_at, u32_at
+from artemis_drivers.livox_decoder import IMU, IMU_SLOTS, POINT_SLOTS, POINTS, LivoxDecoder, RawArrays
 from artemis_drivers.livox_slots import (
     CLOCK_GPS,
     CLOCK_NONE,
     CLOCK_PPS,
     CLOCK_PTP,
     DUPLICATE,
-    IMU_SLOT,
-    POINT_SLOT,
     STANDARD_GRAVITY,
-    TRACK,
     ImuArrays,
     PointArrays,
     days_of,
-    imu_arrays,
-    point_arrays,
     track,
     unwrapped_second,
 )
@@ -46,99 +41,29 @@ RETURNS = np.array([0, 0, 1, 1, 2, 2, 1, 3, 3], np.int64)
 SHOT_BYTES = np.array([0, 0, 14, 10, 28, 16, 24, 42, 22], np.int64)
 _SPHERICAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1], np.int64)
 
-BAD = np.dtype([("version", "i8"), ("type", "i8"), ("length", "i8"), ("time", "i8")])
-"""Packets refused: unknown header version, unknown data type, wrong length for its type, impossible date."""
-POINTS, IMU = 0, 1  # rows of the two streams' TRACK
 
+class Decoder(LivoxDecoder):
+    """Decodes the raw packets of one Avia."""
 
-class Decoder:
-    """Decodes the raw packets of one device into a ring of points and a ring of IMU samples."""
-
-    def __init__(self, packets: Ring, *, point_slots: int = 8192, imu_slots: int = 2048) -> None:
-        self.packets = packets
-        self.points = Ring(POINT_SLOT, point_slots)
-        self.imu = Ring(IMU_SLOT, imu_slots)
-        self.tracks = np.zeros(2, TRACK)
-        self.bad = np.zeros(1, BAD)
-        self.last = np.zeros(1, LAST)
+    def __init__(self, packets: Ring, *, point_slots: int = POINT_SLOTS, imu_slots: int = IMU_SLOTS) -> None:
+        super().__init__(packets, point_slots=point_slots, imu_slots=imu_slots)
         self._anchor = np.zeros(3, np.int64)
-        self._raw = RawArrays(*packets.field.values())
-        self._points, self._imu = point_arrays(self.points), imu_arrays(self.imu)
 
-    def decode(self, first: int, count: int) -> None:
-        """Decode raw packets ``first .. first + count - 1`` and publish what they hold."""
-        step = min(self.points.slots, self.imu.slots)
-        for start in range(first, first + count, step):
-            n = min(step, first + count - start)
-            at = (self.points.claim(n), self.imu.claim(n))
-            made = decode_packets(
-                self._raw,
-                start,
-                n,
-                self._points,
-                at[0],
-                self._imu,
-                at[1],
-                self.tracks,
-                self.bad,
-                self.last,
-                self._anchor,
-            )
-            self.points.publish(made[0])
-            self.imu.publish(made[1])
-
-    def warm_up(self) -> None:
-        """Have the kernels compiled before the first packet arrives."""
-        decode_packets(
-            self._raw, 0, 0, self._points, 0, self._imu, 0, self.tracks, self.bad, self.last, self._anchor
+    def _run(self, first: int, count: int, point_at: int, imu_at: int) -> tuple[int, int]:
+        made: tuple[int, int] = decode_packets(
+            self.raw,
+            first,
+            count,
+            self.point_fields,
+            point_at,
+            self.imu_fields,
+            imu_at,
+            self.tracks,
+            self.bad,
+            self.last,
+            self._anchor,
         )
-
-    def latest(self) -> tuple[int, int, int]:
-        """Data type of the latest points, status code and timestamp type of the latest packet."""
-        last = self.last[0]
-        return int(last["data_type"]), int(last["status"]), int(last["clock"])
-
-    def counters(self) -> dict[str, int]:
-        """Losses of both streams by name, and packets that could not be understood."""
-        names = ("packets", "lost", "gaps", "late", "duplicates", "clock_steps", "clock_changes")
-        found = {
-            f"{stream}_{name}": int(self.tracks[row][name])
-            for row, stream in ((POINTS, "points"), (IMU, "imu"))
-            for name in names
-        }
-        return found | {f"bad_{name}": int(self.bad[0][name]) for name in BAD.names or ()}
-
-
-class RawArrays(NamedTuple):
-    """Fields of a packet ring, for kernels."""
-
-    rx_ns: NDArray[np.int64]
-    size: NDArray[np.int32]
-    data: NDArray[np.uint8]
-
-
-LAST = np.dtype([("status", "u4"), ("clock", "u1"), ("data_type", "u1")])
-"""Status code, timestamp type and point data type of the latest packets."""
-
-
-@njit
-def _u16(b: NDArray[np.uint8], at: int) -> np.int64:
-    # int() of a byte would be unsigned in compiled code, and unsigned with signed becomes a float there
-    value: np.int64 = np.int64(b[at]) | np.int64(b[at + 1]) << 8
-    return value
-
-
-@njit
-def _u32(b: NDArray[np.uint8], at: int) -> np.int64:
-    value: np.int64 = (
-        np.int64(b[at]) | np.int64(b[at + 1]) << 8 | np.int64(b[at + 2]) << 16 | np.int64(b[at + 3]) << 24
-    )
-    return value
-
-
-@njit
-def _i32(b: NDArray[np.uint8], at: int) -> int:
-    return int(np.int32(_u32(b, at)))
+        return made
 
 
 @njit
@@ -151,11 +76,11 @@ def packet_time(b: NDArray[np.uint8], rx: int, anchor: NDArray[np.int64]) -> int
     kind = b[8]
     if kind == CLOCK_GPS:
         days = days_of(2000 + np.int64(b[10]), np.int64(b[11]), np.int64(b[12]))
-        microseconds = int(_u32(b, 14))
+        microseconds = int(u32_at(b, 14))
         if days < 0 or b[13] > 23 or microseconds >= 3_600_000_000:
             return -1
         return int(((days * 24 + np.int64(b[13])) * 3_600_000_000 + microseconds) * 1000)
-    time = int(_u32(b, 10) | _u32(b, 14) << 32)
+    time = int(u32_at(b, 10) | u32_at(b, 14) << 32)
     if time < 0 or kind not in (CLOCK_NONE, CLOCK_PTP, CLOCK_PPS):
         return -1
     if kind == CLOCK_PPS:
@@ -174,9 +99,9 @@ def _cartesian(
     """Points of 14 bytes: i32 x, y, z in mm, reflectivity, tag; returns of a shot follow one another."""
     for i in range(n):
         at = HEADER_BYTES + 14 * i
-        xyz[i, 0] = _i32(b, at) * 1e-3
-        xyz[i, 1] = _i32(b, at + 4) * 1e-3
-        xyz[i, 2] = _i32(b, at + 8) * 1e-3
+        xyz[i, 0] = i32_at(b, at) * 1e-3
+        xyz[i, 1] = i32_at(b, at + 4) * 1e-3
+        xyz[i, 2] = i32_at(b, at + 8) * 1e-3
         refl[i], tag[i] = b[at + 12], b[at + 13]
 
 
@@ -197,12 +122,12 @@ def _spherical(
     for s in range(shots):
         at = HEADER_BYTES + s * (4 + 6 * returns)
         angles = at + 4 if returns == 1 else at
-        theta, phi = _u16(b, angles) * unit, _u16(b, angles + 2) * unit
+        theta, phi = u16_at(b, angles) * unit, u16_at(b, angles + 2) * unit
         x, y, z = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
         for r in range(returns):
             i = s * returns + r
             echo = at if returns == 1 else at + 4 + 6 * r
-            depth = _u32(b, echo) * 1e-3
+            depth = u32_at(b, echo) * 1e-3
             xyz[i, 0], xyz[i, 1], xyz[i, 2] = depth * x, depth * y, depth * z
             rest = at + 8 if returns == 1 else echo + 4
             refl[i], tag[i] = b[rest], b[rest + 1]
@@ -254,7 +179,7 @@ def decode_packets(
         period = IMU_PERIOD_NS if kind == IMU_TYPE else int(SHOTS[kind] * SHOT_NS)
         if track(tracks, stream, stamp, np.int64(b[8]), rx, period) == DUPLICATE:
             continue
-        last[0].status, last[0].clock = _u32(b, 4), b[8]
+        last[0].status, last[0].clock = u32_at(b, 4), b[8]
         if kind == IMU_TYPE:
             _put_imu(b, stamp, rx, number, imu, (imu_at + n_imu) % imu.stamp_ns.size)
             n_imu += 1
@@ -270,7 +195,7 @@ def _put_points(b: NDArray[np.uint8], stamp: int, rx: int, number: int, p: Point
     kind = np.int64(b[9])
     shots, returns = SHOTS[kind], RETURNS[kind]
     p.stamp_ns[at], p.rx_ns[at], p.packet[at] = stamp, rx, number
-    p.shot_ns[at], p.status[at] = SHOT_NS, _u32(b, 4)
+    p.shot_ns[at], p.status[at] = SHOT_NS, u32_at(b, 4)
     p.filled[at], p.returns[at], p.lines[at] = shots * returns, returns, LINES
     p.data_type[at], p.clock[at] = kind, b[8]
     if _SPHERICAL[kind]:
@@ -281,8 +206,7 @@ def _put_points(b: NDArray[np.uint8], stamp: int, rx: int, number: int, p: Point
 
 @njit
 def _put_imu(b: NDArray[np.uint8], stamp: int, rx: int, number: int, imu: ImuArrays, at: int) -> None:
-    values = b[HEADER_BYTES : HEADER_BYTES + 24].view(np.float32)
     imu.stamp_ns[at], imu.rx_ns[at], imu.packet[at], imu.clock[at] = stamp, rx, number, b[8]
     for k in range(3):
-        imu.gyro[at, k] = values[k]
-        imu.accel[at, k] = values[3 + k] * STANDARD_GRAVITY
+        imu.gyro[at, k] = f32_at(b, HEADER_BYTES + 4 * k)
+        imu.accel[at, k] = f32_at(b, HEADER_BYTES + 12 + 4 * k) * STANDARD_GRAVITY

@@ -1,0 +1,76 @@
+"""What the decoders of both Livox protocols share: their rings, their counters, their state."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from artemis_drivers.livox_slots import IMU_SLOT, POINT_SLOT, TRACK, imu_arrays, point_arrays
+from artemis_drivers.ring import Ring
+
+POINT_SLOTS = 8192  # 3.3 s of single returns, 1 s of triple returns
+IMU_SLOTS = 2048
+POINTS, IMU = 0, 1  # rows of the two streams' TRACK
+
+BAD = np.dtype([("version", "i8"), ("type", "i8"), ("length", "i8"), ("time", "i8")])
+"""Packets refused: unknown header version, unknown data type, wrong length for its type, impossible date."""
+
+LAST = np.dtype([("status", "u4"), ("clock", "u1"), ("data_type", "u1")])
+"""Status code, timestamp type and point data type of the latest packets."""
+
+
+class RawArrays(NamedTuple):
+    """Fields of a packet ring, for kernels."""
+
+    rx_ns: NDArray[np.int64]
+    size: NDArray[np.int32]
+    data: NDArray[np.uint8]
+
+
+class LivoxDecoder(ABC):
+    """Decodes the raw packets of one device into a ring of points and a ring of IMU samples."""
+
+    def __init__(self, packets: Ring, *, point_slots: int = POINT_SLOTS, imu_slots: int = IMU_SLOTS) -> None:
+        self.packets = packets
+        self.points = Ring(POINT_SLOT, point_slots)
+        self.imu = Ring(IMU_SLOT, imu_slots)
+        self.tracks = np.zeros(2, TRACK)
+        self.bad = np.zeros(1, BAD)
+        self.last = np.zeros(1, LAST)
+        self.raw = RawArrays(*packets.field.values())
+        self.point_fields, self.imu_fields = point_arrays(self.points), imu_arrays(self.imu)
+
+    @abstractmethod
+    def _run(self, first: int, count: int, point_at: int, imu_at: int) -> tuple[int, int]:
+        """Call the protocol's kernel; how many point and IMU slots it filled."""
+
+    def decode(self, first: int, count: int) -> None:
+        """Decode raw packets ``first .. first + count - 1`` and publish what they hold."""
+        step = min(self.points.slots, self.imu.slots)
+        for start in range(first, first + count, step):
+            n = min(step, first + count - start)
+            points, samples = self._run(start, n, self.points.claim(n), self.imu.claim(n))
+            self.points.publish(points)
+            self.imu.publish(samples)
+
+    def warm_up(self) -> None:
+        """Have the kernels compiled before the first packet arrives."""
+        self._run(0, 0, 0, 0)
+
+    def latest(self) -> tuple[int, int, int]:
+        """Data type of the latest points, status code and timestamp type of the latest packet."""
+        last = self.last[0]
+        return int(last["data_type"]), int(last["status"]), int(last["clock"])
+
+    def counters(self) -> dict[str, int]:
+        """Losses of both streams by name, and packets that could not be understood."""
+        names = ("packets", "lost", "gaps", "late", "duplicates", "clock_steps", "clock_changes")
+        found = {
+            f"{stream}_{name}": int(self.tracks[row][name])
+            for row, stream in ((POINTS, "points"), (IMU, "imu"))
+            for name in names
+        }
+        return found | {f"bad_{name}": int(self.bad[0][name]) for name in BAD.names or ()}

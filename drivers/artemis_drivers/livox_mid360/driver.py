@@ -1,0 +1,77 @@
+"""Driver of one or several Livox Mid-360, and of a rig that has Avias as well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from artemis_drivers.livox_avia.driver import AviaFinder, avia_lidar, spread_ports
+from artemis_drivers.livox_avia.settings import AviaConfig
+from artemis_drivers.livox_dialogue import MS, Datagram
+from artemis_drivers.livox_host import Finder, LivoxHost, LivoxLidar, Ports, check_lidars, packet_ring
+from artemis_drivers.livox_mid360.control import Mid360Session
+from artemis_drivers.livox_mid360.points import Decoder
+from artemis_drivers.livox_mid360.protocol import DISCOVERY_PORT, Cmd, Found, Frame, decode, encode
+from artemis_drivers.livox_mid360.settings import Mid360Config
+from artemis_drivers.udp import Interface, interfaces
+
+SEARCH_EVERY_NS = 1000 * MS
+EVERYBODY = "255.255.255.255"
+
+
+class Mid360Finder:
+    """Searches while a session lacks its device, and gives each answer to the session it belongs to."""
+
+    port = DISCOVERY_PORT
+
+    def __init__(self, sessions: Sequence[Mid360Session], search_address: str = EVERYBODY) -> None:
+        self._sessions, self._address = sessions, search_address
+        self._searched = -SEARCH_EVERY_NS
+        self._seq = 0
+
+    def hear(self, datagram: bytes, ip: str, now: int) -> None:
+        """A datagram on the discovery port (our own search comes back too)."""
+        for frame in decode(datagram)[0]:
+            found = Found.decode(frame.data)
+            if frame.cmd != Cmd.SEARCH or not frame.is_answer or found is None or found.ret != 0:
+                continue
+            for session in sorted(self._sessions, key=lambda s: not s.wants(found.serial)):
+                if session.hear_found(found, ip, now):
+                    break
+
+    def due(self, now: int) -> list[Datagram]:
+        """A search, once a second while somebody is missing."""
+        if now - self._searched < SEARCH_EVERY_NS or not any(s.searching() for s in self._sessions):
+            return []
+        self._searched = now
+        self._seq += 1
+        frame = Frame(self._seq & 0xFFFFFFFF, Cmd.SEARCH, is_answer=False, from_lidar=False)
+        return [Datagram(encode(frame), (self._address, DISCOVERY_PORT))]
+
+
+def mid360_lidar(
+    config: Mid360Config, own_addresses: Callable[[], list[Interface]] = interfaces
+) -> tuple[LivoxLidar, Mid360Session]:
+    """One Mid-360 for a LivoxHost, and its session for the Mid360Finder."""
+    session, packets = Mid360Session(config, own_addresses), packet_ring()
+    ports = Ports((config.command_port, config.push_port), (config.point_port, config.imu_port))
+    return LivoxLidar(config.name, ports, session, packets, Decoder(packets)), session
+
+
+def livox_driver(
+    avias: Sequence[AviaConfig] = (),
+    mid360s: Sequence[Mid360Config] = (),
+    *,
+    own_addresses: Callable[[], list[Interface]] = interfaces,
+    search_address: str = EVERYBODY,
+) -> LivoxHost:
+    """Driver of all Livox LiDARs of a rig. Raises DriverError when two configurations contradict each other."""
+    first = [avia_lidar(c, own_addresses) for c in spread_ports(avias)]
+    second = [mid360_lidar(c, own_addresses) for c in mid360s]
+    lidars = [lidar for lidar, _ in first] + [lidar for lidar, _ in second]
+    check_lidars(lidars)
+    finders: list[Finder] = []
+    if first:
+        finders.append(AviaFinder([session for _, session in first]))
+    if second:
+        finders.append(Mid360Finder([session for _, session in second], search_address))
+    return LivoxHost(lidars, finders)
