@@ -1,11 +1,14 @@
-"""The virtual worlds by name."""
+"""The virtual worlds by name, and worlds from files."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
-from artemis_drivers.virtual import corridor, courtyard, hall, street
+from artemis_drivers.virtual import corridor, courtyard, hall, loaded, street
 from artemis_drivers.virtual.world import World
+
+MODEL_SUFFIXES = (".glb", ".gltf", ".obj")
 
 #: Builds a world from (seed, length of path in metres that a walk needs at least).
 BuildWorld = Callable[[int, float], World]
@@ -20,3 +23,19 @@ def worlds() -> dict[str, BuildWorld]:
         "corridor": corridor.build_corridor,
         "facade": corridor.build_facade,
     }
+
+
+def build_world(name: str, seed: int, length: float) -> World:
+    """The world called ``name``, or the one in the file of that name (.glb, .gltf, .obj).
+
+    Raises ValueError, one sentence, when there is none or the file cannot be used.
+    """
+    known = worlds()
+    if name in known:
+        return known[name](seed, length)
+    if Path(name).suffix.lower() in MODEL_SUFFIXES:
+        return loaded.load(Path(name), seed, length)
+    raise ValueError(
+        f"no virtual world named '{name}'; there are: {', '.join(known)}, and files that end in "
+        f"{', '.join(MODEL_SUFFIXES)}"
+    )

@@ -7,7 +7,7 @@ is multiplied on top with other periods, so that the repetition does not show.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -129,30 +129,54 @@ def _packed(picture: U8) -> I32:
     return np.asarray(r | g << 8 | b << 16, np.int32)
 
 
-def build_atlas(seed: int) -> TextureAtlas:
-    """All materials drawn from ``seed``; the same seed gives the same bytes."""
-    recipes = _recipes()
+@dataclass(frozen=True, slots=True)
+class Material:
+    """One material of an atlas: ``picture`` uint8 (SIZE, SIZE, 3) RGB; the others as in TextureArrays."""
+
+    picture: U8
+    metres: float
+    reflectivity: float
+    gloss: float = 0.0
+    glass: bool = False
+
+
+def pack_atlas(materials: Iterable[tuple[str, Material]]) -> TextureAtlas:
+    """Atlas of named materials; the first is the slow picture (MACRO)."""
     levels: list[I32] = []
-    start = np.empty((len(recipes), LEVELS), np.int64)
-    luma = np.empty(len(recipes), np.float32)
+    start: list[list[int]] = []
+    rows: list[tuple[float, float, float, float, bool]] = []
+    names: list[str] = []
     count = 0
-    for m, (name, recipe) in enumerate(recipes.items()):
-        rng = np.random.default_rng([seed, 7, *name.encode()])
-        picture = np.rint(np.clip(recipe.draw(rng), 0, 1) * 255).astype(np.uint8)
-        luma[m] = picture.mean()
-        for level in range(LEVELS):
-            start[m, level] = count
+    for name, m in materials:
+        picture = m.picture
+        names.append(name)
+        rows.append((m.metres, m.reflectivity, m.gloss, float(picture.mean()), m.glass))
+        start.append([])
+        for _ in range(LEVELS):
+            start[-1].append(count)
             levels.append(_packed(picture))
             count += len(levels[-1])
             half = picture.shape[0] // 2
-            picture = cv2.resize(picture, (half, half), interpolation=cv2.INTER_AREA)
+            picture = np.asarray(cv2.resize(picture, (half, half), interpolation=cv2.INTER_AREA), np.uint8)
+    metres, reflectivity, gloss, luma, glass = zip(*rows, strict=True)
     arrays = TextureArrays(
         np.concatenate(levels),
-        start,
-        np.array([r.metres for r in recipes.values()], np.float32),
-        np.array([r.reflectivity for r in recipes.values()], np.float32),
-        np.array([r.gloss for r in recipes.values()], np.float32),
-        luma,
-        np.array([r.glass for r in recipes.values()], np.bool_),
+        np.array(start, np.int64),
+        np.array(metres, np.float32),
+        np.array(reflectivity, np.float32),
+        np.array(gloss, np.float32),
+        np.array(luma, np.float32),
+        np.array(glass, np.bool_),
     )
-    return TextureAtlas(arrays, {name: m for m, name in enumerate(recipes)})
+    return TextureAtlas(arrays, {name: k for k, name in enumerate(names)})
+
+
+def build_atlas(seed: int) -> TextureAtlas:
+    """All materials drawn from ``seed``; the same seed gives the same bytes."""
+
+    def drawn(name: str, recipe: _Recipe) -> Material:
+        rng = np.random.default_rng([seed, 7, *name.encode()])
+        picture = np.rint(np.clip(recipe.draw(rng), 0, 1) * 255).astype(np.uint8)
+        return Material(picture, recipe.metres, recipe.reflectivity, recipe.gloss, recipe.glass)
+
+    return pack_atlas((name, drawn(name, recipe)) for name, recipe in _recipes().items())

@@ -37,7 +37,8 @@ class World:
 
     ``path`` float64 (n, 3), metres, is the line a walker's eyes follow: points at most 0.5 m apart, nothing
     but movers within 0.3 m of it. It may climb stairs (z changes). ``looks_at`` float64 (m, 3) are places
-    worth a look; there may be none.
+    worth a look; there may be none. ``notes`` are sentences that the user should read: what of a loaded file
+    could not be taken as it is.
     """
 
     name: str
@@ -49,6 +50,7 @@ class World:
     atlas: TextureAtlas
     class_names: tuple[str, ...] = CLASS_NAMES
     movers: tuple[Mover, ...] = ()
+    notes: tuple[str, ...] = ()
     looks_at: F64 = field(default_factory=lambda: np.empty((0, 3)))
 
     @property
