@@ -110,6 +110,17 @@ def test_inner_index_names_each_voxel_of_a_block_once() -> None:
     assert places == set(range(512))
 
 
+def test_lowest_bit_against_strings() -> None:
+    rng = np.random.default_rng(10)
+    masks = [1 << k for k in range(64)] + [
+        2**64 - 1,
+        3 << 62,
+        *map(int, rng.integers(1, 2**63, 300, np.uint64)),
+    ]
+    for mask in masks:
+        assert bs.lowest_bit(np.uint64(mask)) == f"{mask:b}"[::-1].index("1")
+
+
 def _patch(n: int, mark: int) -> np.ndarray:
     return np.full((n, 3), mark % 65536, np.uint16)
 
