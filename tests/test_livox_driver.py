@@ -12,14 +12,20 @@ import pytest
 from artemis_drivers.base import DriverError, Health, State
 from artemis_drivers.livox_avia.control import AviaSession
 from artemis_drivers.livox_avia.driver import spread_ports
-from artemis_drivers.livox_avia.protocol import Lidar, WorkState
+from artemis_drivers.livox_avia.items import command
+from artemis_drivers.livox_avia.payloads import Broadcast
+from artemis_drivers.livox_avia.protocol import Frame, General, Kind, Lidar, WorkState, decode, encode
 from artemis_drivers.livox_avia.settings import AviaConfig, StoredExtrinsic
 from artemis_drivers.livox_host import LivoxHost
 from artemis_drivers.livox_mid360.driver import livox_driver
 from artemis_drivers.livox_slots import collect
 from artemis_drivers.ring import RingReader
 from artemis_drivers.udp import Interface, interfaces, open_udp, port_holder, receive_buffer_warning
-from artemis_drivers.virtual.wire_avia import DeviceClock, Faults, VirtualAvia, steady_imu, steady_shots
+from artemis_drivers.virtual.wire_avia import Faults, VirtualAvia
+from artemis_drivers.virtual.wire_clock import DeviceClock
+from artemis_drivers.virtual.wire_stream import steady_imu, steady_shots
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -368,8 +374,6 @@ def test_wrong_host_address_and_wrong_serial() -> None:
     session.start(0)
     session.tick(6 * SECOND)
     assert "no Livox Avia is heard" in session.message
-    from artemis_drivers.livox_avia.payloads import Broadcast
-
     assert not session.hear_broadcast(Broadcast("3JEDK1E001F6361", 7), "192.168.1.10", 6 * SECOND)
     assert "OTHER is not heard, but 3JEDK1E001F6361 at 192.168.1.10 is" in session.message
     free = AviaSession(AviaConfig())
@@ -379,8 +383,6 @@ def test_wrong_host_address_and_wrong_serial() -> None:
 
 
 def test_handshake_without_answer() -> None:
-    from artemis_drivers.livox_avia.payloads import Broadcast
-
     here = [Interface("eth0", IPv4Address("192.168.1.50"), IPv4Network("192.168.1.0/24"))]
     session = AviaSession(AviaConfig(), lambda: here)
     session.start(0)
@@ -437,3 +439,65 @@ def test_stop_without_device_and_twice() -> None:
     driver.stop()
     assert one(driver).state == State.STOPPED
     driver.lidars[0].send_utc(0)
+
+
+# -- the session alone, in simulated time -----------------------------------------------------------------------
+
+ANSWERS = st.tuples(
+    st.integers(0, 40), st.sampled_from([*General, *Lidar]), st.binary(max_size=8), st.booleans()
+)
+EVENTS = st.one_of(
+    st.tuples(st.just("wait"), st.integers(1, 1500)),
+    st.tuples(st.just("broadcast"), st.sampled_from(["3JEDK1E001F6361", "OTHER"])),
+    st.tuples(st.just("answer"), ANSWERS),
+    st.tuples(st.just("obey"), st.integers(0, 1)),
+    st.tuples(st.just("noise"), st.binary(max_size=40)),
+    st.tuples(st.just("data"), st.integers(0, 8)),
+    st.tuples(st.just("utc"), st.integers(0, 10**9)),
+    st.tuples(st.just("stop"), st.just(0)),
+)
+
+
+@given(st.lists(EVENTS, max_size=60))
+@settings(max_examples=200, deadline=None)
+def test_session_survives_any_course_of_events(events: list[tuple[str, object]]) -> None:
+    here = [Interface("eth0", IPv4Address("192.168.1.50"), IPv4Network("192.168.1.0/24"))]
+    session, now, asked = AviaSession(AviaConfig(), lambda: here), 0, list[Frame]()
+    session.start(now)
+    for what, value in events:
+        match what, value:
+            case "wait", int(ms):
+                now += ms * MS
+            case "broadcast", str(code):
+                session.hear_broadcast(Broadcast(code, 7), "192.168.1.10", now)
+            case "answer", (seq, cmd, payload, is_answer):
+                frame = Frame(
+                    Kind.ACK if is_answer else Kind.MSG, seq, command(cmd) >> 8, command(cmd) & 255, payload
+                )
+                session.hear(encode(frame), "192.168.1.10", now)
+            case "obey", int(ret):
+                for frame in asked[-1:]:
+                    answer = frame._replace(kind=Kind.ACK, payload=bytes([ret, 1, 0, 0, 0, 0, 0]))
+                    session.hear(encode(answer), "192.168.1.10", now)
+            case "noise", bytes(data):
+                session.hear(data, "192.168.1.10", now)
+            case "data", int(kind):
+                session.data_seen(now, kind, 0)
+            case "utc", int(ns):
+                session.send_utc(1_700_000_000 * SECOND + ns)
+            case _:
+                session.begin_stop(now)
+        session.tick(now)
+        for datagram in session.outbox:
+            frames, skipped = decode(datagram.data)
+            assert skipped == 0 and len(frames) == 1 and datagram.address == ("192.168.1.10", 65000)
+            asked += frames
+        assert len(session.outbox) <= 6  # never a flood
+        session.outbox.clear()
+        if session.state in (State.SILENT, State.FAILED):
+            assert session.message
+    session.begin_stop(now)
+    for _ in range(8):
+        now += 600 * MS
+        session.tick(now)
+    assert session.state == State.STOPPED  # silence cannot hold it up

@@ -15,11 +15,12 @@ from artemis_drivers.livox_mid360.driver import livox_driver
 from artemis_drivers.livox_mid360.points import Decoder
 from artemis_drivers.livox_mid360.protocol import Cmd, Found, Frame, HostAddress, Key
 from artemis_drivers.livox_mid360.settings import Mid360Config
-from artemis_drivers.livox_slots import collect
+from artemis_drivers.livox_slots import IMU_SLOT, POINT_SLOT, collect
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import PACKET
-from artemis_drivers.virtual.wire_avia import VirtualAvia, steady_imu, steady_shots
+from artemis_drivers.virtual.wire_avia import VirtualAvia
 from artemis_drivers.virtual.wire_mid360 import VirtualMid360
+from artemis_drivers.virtual.wire_stream import steady_imu, steady_shots
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,7 +29,7 @@ PERIOD = 480_000  # 96 points at 200 kHz
 
 
 def feed(packets: list[tuple[int, bytes]]) -> Decoder:
-    decoder = Decoder(Ring(PACKET, 512), point_slots=512, imu_slots=512)
+    decoder = Decoder(Ring(PACKET, 512), Ring(POINT_SLOT, 512), Ring(IMU_SLOT, 512))
     for rx, data in packets:
         row = np.zeros(PACKET["data"].shape, np.uint8)
         row[: len(data)] = np.frombuffer(data, np.uint8)

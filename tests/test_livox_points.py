@@ -9,7 +9,18 @@ import pytest
 from artemis_drivers.livox_avia import encode
 from artemis_drivers.livox_avia.payloads import decode_utc
 from artemis_drivers.livox_avia.points import HEADER_BYTES, RETURNS, SHOT_BYTES, SHOTS, Decoder
-from artemis_drivers.livox_slots import DUPLICATE, LATE, NEW, TRACK, Cloud, collect, days_of, track
+from artemis_drivers.livox_slots import (
+    DUPLICATE,
+    IMU_SLOT,
+    LATE,
+    NEW,
+    POINT_SLOT,
+    TRACK,
+    Cloud,
+    collect,
+    days_of,
+    track,
+)
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import PACKET, packet_bytes
 from hypothesis import given, settings
@@ -22,7 +33,7 @@ Slots = dict[str, np.ndarray]
 
 def feed(packets: list[tuple[int, bytes]], decoder: Decoder | None = None) -> Decoder:
     """Packets with their times of arrival (ns) put into a raw ring and decoded in one go."""
-    decoder = decoder or Decoder(Ring(PACKET, 512), point_slots=512, imu_slots=512)
+    decoder = decoder or Decoder(Ring(PACKET, 512), Ring(POINT_SLOT, 512), Ring(IMU_SLOT, 512))
     first = decoder.packets.published
     for rx, data in packets:
         row = np.zeros(PACKET["data"].shape, np.uint8)
@@ -360,7 +371,7 @@ def test_raw_packets_stay_readable() -> None:
 
 
 def test_more_packets_than_slots_keep_the_newest() -> None:
-    decoder = Decoder(Ring(PACKET, 64), point_slots=8, imu_slots=8)
+    decoder = Decoder(Ring(PACKET, 64), Ring(POINT_SLOT, 8), Ring(IMU_SLOT, 8))
     feed([(k, encode.imu_packet(0, 0, k * 5 * MS, (k, 0, 0), (0,) * 3)) for k in range(20)], decoder)
     assert decoder.counters()["imu_packets"] == 20
     assert slots(decoder.imu)["gyro"][:, 0].tolist()[-4:] == [16, 17, 18, 19]

@@ -8,11 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_drivers.livox_slots import IMU_SLOT, POINT_SLOT, TRACK, imu_arrays, point_arrays
+from artemis_drivers.livox_slots import TRACK, imu_arrays, point_arrays
 from artemis_drivers.ring import Ring
 
-POINT_SLOTS = 8192  # 3.3 s of single returns, 1 s of triple returns
-IMU_SLOTS = 2048
 POINTS, IMU = 0, 1  # rows of the two streams' TRACK
 
 BAD = np.dtype([("version", "i8"), ("type", "i8"), ("length", "i8"), ("time", "i8")])
@@ -33,10 +31,9 @@ class RawArrays(NamedTuple):
 class LivoxDecoder(ABC):
     """Decodes the raw packets of one device into a ring of points and a ring of IMU samples."""
 
-    def __init__(self, packets: Ring, *, point_slots: int = POINT_SLOTS, imu_slots: int = IMU_SLOTS) -> None:
-        self.packets = packets
-        self.points = Ring(POINT_SLOT, point_slots)
-        self.imu = Ring(IMU_SLOT, imu_slots)
+    def __init__(self, packets: Ring, points: Ring, imu: Ring) -> None:
+        """``packets`` of udp.PACKET, ``points`` of POINT_SLOT, ``imu`` of IMU_SLOT."""
+        self.packets, self.points, self.imu = packets, points, imu
         self.tracks = np.zeros(2, TRACK)
         self.bad = np.zeros(1, BAD)
         self.last = np.zeros(1, LAST)

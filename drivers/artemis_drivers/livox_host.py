@@ -17,14 +17,15 @@ from typing import NamedTuple, Protocol
 
 from artemis_drivers.base import Applied, DriverError, Health, State
 from artemis_drivers.livox_dialogue import Datagram
-from artemis_drivers.livox_slots import CLOCK_NAMES
-from artemis_drivers.ring import Ring
+from artemis_drivers.livox_slots import CLOCK_NAMES, IMU_SLOT, POINT_SLOT
+from artemis_drivers.ring import Ring, RingMaker
 from artemis_drivers.udp import PACKET, RECEIVE_BUFFER, PacketReceiver, open_udp, receive_buffer_warning
 
 POLL_S = 0.004  # 10 packets of an Avia; the kernel has stamped them on arrival
 _BATCH = 256
 _STOP_S = 1.5
 PACKET_SLOTS = 8192  # 3.3 s of single returns, 1 s of triple returns
+IMU_SLOTS = 2048
 
 
 class Session(Protocol):
@@ -51,6 +52,7 @@ class Session(Protocol):
 class Decoder(Protocol):
     """What the host thread needs of a decoder; see livox_avia.points.Decoder."""
 
+    packets: Ring
     points: Ring
     imu: Ring
 
@@ -79,10 +81,9 @@ class Ports(NamedTuple):
 class LivoxLidar:
     """One LiDAR: its session, its decoder, its rings ``packets`` (raw), ``points`` and ``imu``."""
 
-    def __init__(self, name: str, ports: Ports, session: Session, packets: Ring, decoder: Decoder) -> None:
-        self.name, self.ports, self.session = name, ports, session
-        self.packets, self.decoder = packets, decoder
-        self.points, self.imu = decoder.points, decoder.imu
+    def __init__(self, name: str, ports: Ports, session: Session, decoder: Decoder) -> None:
+        self.name, self.ports, self.session, self.decoder = name, ports, session, decoder
+        self.packets, self.points, self.imu = decoder.packets, decoder.points, decoder.imu
         self.warning = ""
         self._utc: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._control: list[socket.socket] = []
@@ -249,9 +250,13 @@ def check_lidars(lidars: Sequence[LivoxLidar]) -> None:
             raise DriverError(f"{count} LiDARs use the same UDP port {port}: give each its own")
 
 
-def packet_ring() -> Ring:
-    """A ring of raw packets of the usual size."""
-    return Ring(PACKET, PACKET_SLOTS)
+def rings(name: str, make_ring: RingMaker) -> tuple[Ring, Ring, Ring]:
+    """Rings ``name.packets``, ``name.points`` and ``name.imu`` of one LiDAR."""
+    return (
+        make_ring(f"{name}.packets", PACKET, PACKET_SLOTS),
+        make_ring(f"{name}.points", POINT_SLOT, PACKET_SLOTS),
+        make_ring(f"{name}.imu", IMU_SLOT, IMU_SLOTS),
+    )
 
 
 def _waiting(sock: socket.socket, limit: int = 64) -> list[tuple[bytes, str]]:

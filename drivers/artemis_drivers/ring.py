@@ -8,7 +8,7 @@ directly. Slots are numbered from 0 without end; slot ``n`` lives in row ``n % s
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,15 @@ class Ring:
         """Number of the oldest slot that is certainly intact."""
         with self._fence:
             return max(0, int(self._head[_CLAIMED]) - self.slots)
+
+
+RingMaker = Callable[[str, "np.dtype[np.void]", int], Ring]
+"""Makes a ring from its name, slot type and number of slots; the name tells apart rings in shared memory."""
+
+
+def private_ring(name: str, dtype: np.dtype[np.void], slots: int) -> Ring:
+    """A RingMaker for rings that stay in this process."""
+    return Ring(dtype, slots)
 
 
 class RingReader:

@@ -22,7 +22,7 @@ from artemis_drivers.livox_avia import encode
 from artemis_drivers.livox_avia.points import SHOTS, Decoder
 from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.livox_mid360.driver import livox_driver
-from artemis_drivers.livox_slots import collect
+from artemis_drivers.livox_slots import IMU_SLOT, POINT_SLOT, collect
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import PACKET
 from artemis_drivers.virtual.wire_avia import VirtualAvia
@@ -43,7 +43,7 @@ def decode_ms(data_type: int) -> tuple[float, float]:
     """Median CPU ms to decode, and to collect, 100 ms of shots (24,000 points in single return)."""
     count = 24_000 // int(SHOTS[data_type])
     ring = Ring(PACKET, 1024)
-    decoder = Decoder(ring)
+    decoder = Decoder(ring, Ring(POINT_SLOT, 1024), Ring(IMU_SLOT, 64))
     made = packets(data_type, count * 30)
     decoding, collecting = [], []
     for frame in range(30):

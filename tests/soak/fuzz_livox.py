@@ -7,6 +7,7 @@ a valid header. Prints a JSON report of what was run.
 """
 
 import argparse
+import itertools
 import json
 import resource
 import sys
@@ -22,6 +23,7 @@ from artemis_drivers.livox_decoder import LivoxDecoder
 from artemis_drivers.livox_mid360 import encode as encode2
 from artemis_drivers.livox_mid360 import points as points2
 from artemis_drivers.livox_mid360 import protocol as sdk2
+from artemis_drivers.livox_slots import IMU_SLOT, POINT_SLOT
 from artemis_drivers.ring import Ring
 from artemis_drivers.udp import PACKET, PACKET_BYTES
 
@@ -60,7 +62,7 @@ def control1(rng: np.random.Generator) -> list[bytes]:
         )
         for k, (c, i) in enumerate((c, i) for c in (0, 1) for i in range(16))
     ]
-    return frames + [a + b for a, b in zip(frames, frames[1:], strict=False)]
+    return frames + [a + b for a, b in itertools.pairwise(frames)]
 
 
 def control2(rng: np.random.Generator) -> list[bytes]:
@@ -160,6 +162,11 @@ def fuzz(run: Callable[[list[bytes]], float], seeds: list[bytes], count: int, se
     }
 
 
+def rings() -> tuple[Ring, Ring, Ring]:
+    """Rings of a decoder."""
+    return Ring(PACKET, 1024), Ring(POINT_SLOT, 1024), Ring(IMU_SLOT, 1024)
+
+
 def main() -> int:
     """Fuzz all parsers."""
     args = argparse.ArgumentParser(description=__doc__)
@@ -167,13 +174,12 @@ def main() -> int:
     args.add_argument("--seed", type=int, default=1)
     opts = args.parse_args()
     rng = np.random.default_rng(opts.seed)
-    ring1, ring2 = Ring(PACKET, 1024), Ring(PACKET, 1024)
     work = {
         "sdk1_control": (parse_each(sdk1.decode), control1(rng)),
         "sdk2_control": (parse_each(sdk2.decode), control2(rng)),
         "payloads": (parse_each(all_payloads), [f[11:-4] or b"\0" for f in control1(rng)]),
-        "sdk1_data": (decode_batches(points1.Decoder(ring1, point_slots=1024, imu_slots=1024)), data1(rng)),
-        "sdk2_data": (decode_batches(points2.Decoder(ring2, point_slots=1024, imu_slots=1024)), data2(rng)),
+        "sdk1_data": (decode_batches(points1.Decoder(*rings())), data1(rng)),
+        "sdk2_data": (decode_batches(points2.Decoder(*rings())), data2(rng)),
     }
     report = {name: fuzz(run, seeds, opts.count, opts.seed) for name, (run, seeds) in work.items()}
     print(json.dumps({"seed": opts.seed, "parsers": report}, indent=1))

@@ -67,6 +67,7 @@ class AviaSession:
         self._utc_seq: set[int] = set()
         self._began = self._heartbeat_sent = self._heard = self._last_data = self._running_since = 0
         self._in_session = False  # the device has been told where to send
+        self._leaving = False
 
     @property
     def connected(self) -> bool:
@@ -77,13 +78,16 @@ class AviaSession:
 
     def start(self, now: int) -> None:
         """Begin to listen for the device."""
+        self._leaving = False
         self._search("", now)
 
     def begin_stop(self, now: int) -> None:
         """Stop sampling and take leave; ``state`` is STOPPED when that is done or was not answered."""
+        self._leaving = True
         if self.connected and self.state != State.CONNECTING:
             self._dialogue.start(self._farewell(), now)
         else:
+            self._dialogue.cancel()
             self.state = State.STOPPED
 
     def wants(self, code: str) -> bool:
@@ -97,7 +101,7 @@ class AviaSession:
 
     def hear_broadcast(self, broadcast: payloads.Broadcast, ip: str, now: int) -> bool:
         """A device announced itself; True when it is (now) ours."""
-        if self.state == State.STOPPED:
+        if self.state == State.STOPPED or self._leaving:
             return False
         if self._mine() and not self.wants(broadcast.code):
             if not self.connected and now - self._began > UNHEARD_NS:
@@ -144,7 +148,7 @@ class AviaSession:
     def tick(self, now: int) -> None:
         """Whatever is due by the clock."""
         self._dialogue.tick(now)
-        if self.state == State.STOPPED or self.state == State.CONNECTING:
+        if self._leaving or self.state in (State.STOPPED, State.CONNECTING):
             return
         if self._in_session:
             self._beat(now)
@@ -327,7 +331,7 @@ class AviaSession:
             return
         self._heard = now
         self.counters["heartbeats_answered"] += 1
-        if self.state == State.SEARCHING and self._in_session:
+        if self.state == State.SEARCHING and self._in_session and not self._leaving:
             self._dialogue.start(self._configuration(), now)
         self.feature = beat.feature
         self.work_state = (

@@ -12,7 +12,8 @@ from artemis_drivers.livox_avia.points import Decoder
 from artemis_drivers.livox_avia.protocol import DISCOVERY_PORT, General, Kind, decode
 from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.livox_dialogue import Datagram
-from artemis_drivers.livox_host import LivoxLidar, Ports, packet_ring
+from artemis_drivers.livox_host import LivoxLidar, Ports, rings
+from artemis_drivers.ring import RingMaker, private_ring
 from artemis_drivers.udp import Interface, interfaces
 
 
@@ -45,12 +46,14 @@ class AviaFinder:
 
 
 def avia_lidar(
-    config: AviaConfig, own_addresses: Callable[[], list[Interface]] = interfaces
+    config: AviaConfig,
+    own_addresses: Callable[[], list[Interface]] = interfaces,
+    make_ring: RingMaker = private_ring,
 ) -> tuple[LivoxLidar, AviaSession]:
     """One Avia for a LivoxHost, and its session for the AviaFinder."""
-    session, packets = AviaSession(config, own_addresses), packet_ring()
+    session = AviaSession(config, own_addresses)
     ports = Ports((config.command_port,), (config.data_port,))
-    return LivoxLidar(config.name, ports, session, packets, Decoder(packets)), session
+    return LivoxLidar(config.name, ports, session, Decoder(*rings(config.name, make_ring))), session
 
 
 def spread_ports(configs: Sequence[AviaConfig]) -> list[AviaConfig]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from artemis_drivers._jit import njit
 from artemis_drivers.livox_bytes import f32_at, i32_at, u16_at, u32_at
-from artemis_drivers.livox_decoder import IMU, IMU_SLOTS, POINT_SLOTS, POINTS, LivoxDecoder, RawArrays
+from artemis_drivers.livox_decoder import IMU, POINTS, LivoxDecoder, RawArrays
 from artemis_drivers.livox_slots import (
     CLOCK_GPS,
     CLOCK_NONE,
@@ -45,8 +45,8 @@ _SPHERICAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1], np.int64)
 class Decoder(LivoxDecoder):
     """Decodes the raw packets of one Avia."""
 
-    def __init__(self, packets: Ring, *, point_slots: int = POINT_SLOTS, imu_slots: int = IMU_SLOTS) -> None:
-        super().__init__(packets, point_slots=point_slots, imu_slots=imu_slots)
+    def __init__(self, packets: Ring, points: Ring, imu: Ring) -> None:
+        super().__init__(packets, points, imu)
         self._anchor = np.zeros(3, np.int64)
 
     def _run(self, first: int, count: int, point_at: int, imu_at: int) -> tuple[int, int]:

@@ -73,19 +73,23 @@ class Mid360Session:
         self._dialogue = Dialogue(self._put_ask, self._next_seq)
         self._seq = self._command_port = 0
         self._time_seq = -1
+        self._leaving = False
         self._began = self._polled = self._heard = self._last_data = self._running_since = 0
 
     # -- what the host calls ------------------------------------------------------------------------------------
 
     def start(self, now: int) -> None:
         """Begin to search for the device."""
+        self._leaving = False
         self._search("", now)
 
     def begin_stop(self, now: int) -> None:
         """Put the device to idle; ``state`` is STOPPED when that is done or was not answered."""
+        self._leaving = True
         if self.state in (State.RUNNING, State.SILENT, State.CONFIGURING):
             self._dialogue.start(self._farewell(), now)
         else:
+            self._dialogue.cancel()
             self.state = State.STOPPED
 
     def wants(self, serial: str) -> bool:
@@ -99,7 +103,7 @@ class Mid360Session:
 
     def hear_found(self, found: Found, ip: str, now: int) -> bool:
         """A device answered the search; True when it is ours."""
-        if self.state == State.STOPPED:
+        if self.state == State.STOPPED or self._leaving:
             return False
         if not self.wants(found.serial) and (self.config.serial or self.state != State.SEARCHING):
             return False
@@ -147,7 +151,7 @@ class Mid360Session:
                 "no Livox Mid-360 answers the search: check its power, its cable, and that no firewall blocks "
                 f"UDP port {DISCOVERY_PORT}"
             )
-        if self.state not in (State.RUNNING, State.SILENT):
+        if self._leaving or self.state not in (State.RUNNING, State.SILENT):
             return
         if now - self._polled >= POLL_NS:
             self._polled = now

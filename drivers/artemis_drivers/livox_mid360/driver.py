@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from artemis_drivers.livox_avia.driver import AviaFinder, avia_lidar, spread_ports
 from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.livox_dialogue import MS, Datagram
-from artemis_drivers.livox_host import Finder, LivoxHost, LivoxLidar, Ports, check_lidars, packet_ring
+from artemis_drivers.livox_host import Finder, LivoxHost, LivoxLidar, Ports, check_lidars, rings
 from artemis_drivers.livox_mid360.control import Mid360Session
 from artemis_drivers.livox_mid360.points import Decoder
 from artemis_drivers.livox_mid360.protocol import DISCOVERY_PORT, Cmd, Found, Frame, decode, encode
 from artemis_drivers.livox_mid360.settings import Mid360Config
+from artemis_drivers.ring import RingMaker, private_ring
 from artemis_drivers.udp import Interface, interfaces
 
 SEARCH_EVERY_NS = 1000 * MS
@@ -49,12 +50,14 @@ class Mid360Finder:
 
 
 def mid360_lidar(
-    config: Mid360Config, own_addresses: Callable[[], list[Interface]] = interfaces
+    config: Mid360Config,
+    own_addresses: Callable[[], list[Interface]] = interfaces,
+    make_ring: RingMaker = private_ring,
 ) -> tuple[LivoxLidar, Mid360Session]:
     """One Mid-360 for a LivoxHost, and its session for the Mid360Finder."""
-    session, packets = Mid360Session(config, own_addresses), packet_ring()
+    session = Mid360Session(config, own_addresses)
     ports = Ports((config.command_port, config.push_port), (config.point_port, config.imu_port))
-    return LivoxLidar(config.name, ports, session, packets, Decoder(packets)), session
+    return LivoxLidar(config.name, ports, session, Decoder(*rings(config.name, make_ring))), session
 
 
 def livox_driver(
@@ -63,10 +66,14 @@ def livox_driver(
     *,
     own_addresses: Callable[[], list[Interface]] = interfaces,
     search_address: str = EVERYBODY,
+    make_ring: RingMaker = private_ring,
 ) -> LivoxHost:
-    """Driver of all Livox LiDARs of a rig. Raises DriverError when two configurations contradict each other."""
-    first = [avia_lidar(c, own_addresses) for c in spread_ports(avias)]
-    second = [mid360_lidar(c, own_addresses) for c in mid360s]
+    """Driver of all Livox LiDARs of a rig; ``make_ring`` may put their rings into shared memory.
+
+    Raises DriverError when two configurations contradict each other.
+    """
+    first = [avia_lidar(c, own_addresses, make_ring) for c in spread_ports(avias)]
+    second = [mid360_lidar(c, own_addresses, make_ring) for c in mid360s]
     lidars = [lidar for lidar, _ in first] + [lidar for lidar, _ in second]
     check_lidars(lidars)
     finders: list[Finder] = []

@@ -11,20 +11,19 @@ Not known of the real device and therefore parameters or choices of ours: the ti
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import heapq
-import itertools
 import socket
 import struct
+import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from artemis_drivers.livox_avia import encode, payloads
 from artemis_drivers.livox_avia.protocol import (
@@ -41,33 +40,11 @@ from artemis_drivers.livox_avia.protocol import (
     decode,
 )
 from artemis_drivers.livox_avia.protocol import encode as encode_frame
-from artemis_drivers.livox_avia.status import PPS_BIT, SYNC_SHIFT
-from artemis_drivers.livox_slots import CLOCK_GPS, CLOCK_NONE, CLOCK_PPS
+from artemis_drivers.virtual.wire_clock import DeviceClock
+from artemis_drivers.virtual.wire_stream import SHOTS_PER_S, ImuSample, Shots, body, steady_imu, steady_shots
 
 _S = 1_000_000_000
-_SHOTS_PER_S = 240_000
 _POINT_PORT, _IMU_PORT = 60001, 60003  # source ports of the real device, by an independent decoder
-_UTC_EARLIEST, _UTC_LATEST = 10_000_000, 500_000_000  # after the edge, Avia user manual
-_PPS_TIMEOUT = 1_500_000_000
-_SYNC_GPS, _SYNC_PPS, _SYNC_ABNORMAL = 2, 3, 4
-
-
-class Shots(NamedTuple):
-    """Shots at 240 kHz from ``start_ns`` of the true clock on: ``xyz`` float32 (shots, returns, 3) metres in the
-    LiDAR's frame (0, 0, 0: no return), ``reflectivity`` and ``tag`` uint8 (shots, returns)."""
-
-    start_ns: int
-    xyz: NDArray[np.float32]
-    reflectivity: NDArray[np.uint8]
-    tag: NDArray[np.uint8]
-
-
-class ImuSample(NamedTuple):
-    """A sample of the built-in IMU: true time, rad/s, m/s2 (gravity included)."""
-
-    time_ns: int
-    gyro: tuple[float, float, float]
-    accel: tuple[float, float, float]
 
 
 @dataclasses.dataclass
@@ -86,51 +63,6 @@ class Faults:
     """(command set, command) answered with an error."""
     unplugged: bool = False
     """Neither hears nor speaks; its clock and its session go on."""
-
-
-class DeviceClock:
-    """The device's stamps of true time: skew, pulses, UTC commands."""
-
-    def __init__(self, power_on_ns: int, skew_ppm: float) -> None:
-        self._origin, self._skew = power_on_ns, skew_ppm * 1e-6
-        self._edge: int | None = None
-        self._utc_of_edge: int | None = None
-        self.utc_late = 0
-
-    def pulse(self, true_ns: int) -> None:
-        """A rising PPS edge."""
-        if self._edge is not None and self._utc_of_edge is not None:
-            self._utc_of_edge += round((true_ns - self._edge) / _S) * _S
-        self._edge = true_ns
-
-    def name_edge(self, unix_ns: int, true_ns: int) -> None:
-        """A UTC command arrived; too early or too late after the edge it means nothing."""
-        if self._edge is not None and _UTC_EARLIEST < true_ns - self._edge < _UTC_LATEST:
-            self._utc_of_edge = unix_ns
-        else:
-            self.utc_late += 1
-
-    def local(self, true_ns: int) -> int:
-        """Nanoseconds since power on, by the device's oscillator."""
-        elapsed = true_ns - self._origin
-        return elapsed + round(elapsed * self._skew)
-
-    def stamp(self, true_ns: int) -> tuple[int, int]:
-        """Timestamp type and time."""
-        if self._edge is None:
-            return CLOCK_NONE, self.local(true_ns)
-        since = self.local(true_ns) - self.local(self._edge)
-        if self._utc_of_edge is None:
-            return CLOCK_PPS, since % _S
-        return CLOCK_GPS, self._utc_of_edge + since
-
-    def status(self, true_ns: int) -> int:
-        """Bits of the status code that tell of synchronisation."""
-        if self._edge is None:
-            return 0
-        if true_ns - self._edge > _PPS_TIMEOUT:
-            return _SYNC_ABNORMAL << SYNC_SHIFT
-        return PPS_BIT | (_SYNC_PPS if self._utc_of_edge is None else _SYNC_GPS) << SYNC_SHIFT
 
 
 class VirtualAvia:
@@ -409,10 +341,10 @@ class VirtualAvia:
         at = 0
         while at < len(batch.xyz):
             n = encode.SHOTS_PER_PACKET[self._data_type()]
-            begin = batch.start_ns + at * _S // _SHOTS_PER_S
+            begin = batch.start_ns + at * _S // SHOTS_PER_S
             part = slice(at, at + n)
             yield (
-                begin + n * _S // _SHOTS_PER_S,
+                begin + n * _S // SHOTS_PER_S,
                 Shots(begin, batch.xyz[part], batch.reflectivity[part], batch.tag[part]),
             )
             at += n
@@ -435,7 +367,7 @@ class VirtualAvia:
         clock, stamp = self.device_time.stamp(what.start_ns)
         data_type = self._data_type()
         head = encode.header(self._status(), clock, data_type, stamp)
-        self._send_data(_POINT_PORT, head + _body(data_type, what), host.data_port)
+        self._send_data(_POINT_PORT, head + body(data_type, what), host.data_port)
 
     def _send_data(self, source_port: int, data: bytes, port: int) -> None:
         draw = self._random.random(3)
@@ -479,43 +411,21 @@ def _bound(ip: str, port: int) -> socket.socket:
     return sock
 
 
-def _body(data_type: int, shots: Shots) -> bytes:
-    """Points of a packet; missing shots and returns are sent as 'no return'."""
-    n, returns = encode.SHOTS_PER_PACKET[data_type], {2: 1, 3: 1, 4: 2, 5: 2, 7: 3, 8: 3}[data_type]
-    xyz = np.zeros((n, returns, 3))
-    reflectivity, tag = np.zeros((n, returns), np.uint8), np.zeros((n, returns), np.uint8)
-    r = min(returns, shots.xyz.shape[1])
-    m = len(shots.xyz)
-    xyz[:m, :r] = shots.xyz[:, :r]
-    reflectivity[:m, :r], tag[:m, :r] = shots.reflectivity[:, :r], shots.tag[:, :r]
-    if data_type in encode.CARTESIAN:
-        return encode.shots_mm(data_type, np.rint(xyz * 1e3).astype(np.int32), reflectivity, tag).tobytes()
-    depth = np.linalg.norm(xyz, axis=2)
-    first = xyz[:, 0]  # all returns of a shot lie on one ray
-    zenith = np.degrees(np.arctan2(np.hypot(first[:, 0], first[:, 1]), first[:, 2]))
-    azimuth = np.degrees(np.arctan2(first[:, 1], first[:, 0])) % 360
-    hundredths = np.rint(zenith * 100).astype(np.uint16), np.rint(azimuth * 100).astype(np.uint16)
-    return encode.shots_spherical(
-        data_type, np.rint(depth * 1e3).astype(np.uint32), *hundredths, reflectivity, tag
-    ).tobytes()
+def main() -> int:
+    """A device for any program that speaks the protocol, such as the official SDK's samples."""
+    args = argparse.ArgumentParser(description=main.__doc__)
+    args.add_argument("--ip", default="127.0.0.1", help="address of the device")
+    args.add_argument("--announce-to", default="127.0.0.1", help="where its broadcasts go")
+    args.add_argument("--code", default="3JEDK1E001F6361", help="broadcast code")
+    args.add_argument("--seconds", type=float, default=60.0)
+    options = args.parse_args()
+    with VirtualAvia(options.code, options.ip, announce_to=options.announce_to) as device:
+        now = time.monotonic_ns()
+        device.play(steady_shots(now, options.seconds, 3), steady_imu(now, options.seconds))
+        time.sleep(options.seconds)
+        print(dict(device.counters))
+    return 0
 
 
-def steady_shots(start_ns: int, seconds: float, returns: int = 1, batch: int = 2400) -> Iterator[Shots]:
-    """A plain test stream: points that wander over a sphere, so that each has its own value."""
-    total = round(seconds * _SHOTS_PER_S)
-    for first in itertools.count(0, batch):
-        if first >= total:
-            return
-        k = np.arange(first, min(first + batch, total))
-        r = 5 + 0.5 * np.arange(returns) + (k[:, None] % 1000) * 1e-3
-        a, b = k * 1e-4, 0.3 * np.sin(k * 3e-4)
-        ray = np.column_stack([np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), np.sin(b)])
-        value = np.broadcast_to((k % 256).astype(np.uint8)[:, None], r.shape)
-        xyz = (r[:, :, None] * ray[:, None, :]).astype(np.float32)
-        yield Shots(start_ns + first * _S // _SHOTS_PER_S, xyz, value, np.zeros(r.shape, np.uint8))
-
-
-def steady_imu(start_ns: int, seconds: float) -> Iterator[ImuSample]:
-    """200 Hz of a device at rest that turns slowly."""
-    for k in range(round(seconds * 200)):
-        yield ImuSample(start_ns + k * 5_000_000, (0.0, 0.0, 0.01), (0.0, 0.0, 9.80665))
+if __name__ == "__main__":
+    sys.exit(main())
