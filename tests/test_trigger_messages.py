@@ -168,7 +168,7 @@ def test_board_clock_notices_a_restart() -> None:
 
 def test_events_are_counted_across_the_wrap() -> None:
     counter = EventCounter()
-    assert [counter.read(raw) for raw in (2**24 - 2, 2**24 - 1, 0, 0, 3)] == [
+    assert [counter.read(raw, raw) for raw in (2**24 - 2, 2**24 - 1, 0, 0, 3)] == [
         2**24 - 2,
         2**24 - 1,
         2**24,
@@ -181,9 +181,8 @@ def test_events_are_counted_across_the_wrap() -> None:
 
 def test_counting_from_0_again_is_a_new_series() -> None:
     counter = EventCounter()
-    for raw in (40, 41, 0, 1):
-        counter.read(raw)
-    assert (counter.series, counter.lost) == (1, 0)
+    assert [counter.read(raw, k) for k, raw in enumerate((40, 41, 0, 0, 1))] == [40, 41, 0, 0, 1]
+    assert (counter.series, counter.lost, counter.repeated) == (2, 0, 0)
 
 
 def test_every_field_of_a_record_is_a_signal() -> None:

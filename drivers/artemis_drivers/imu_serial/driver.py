@@ -23,7 +23,6 @@ IMU_CHUNK = np.dtype([("rx_ns", "i8"), ("size", "i4"), ("data", "u1", (CHUNK_BYT
 
 SILENT_S = 0.5  # a running IMU sends hundreds of samples a second
 _RETRY_S = (0.1, 0.2, 0.4, 0.8)  # back-off; the last one holds
-_BATCH_S = 0.004  # time comes from the device, so a few samples may arrive together: fewer wake-ups
 
 
 class SerialImu:
@@ -123,7 +122,8 @@ class SerialImu:
     def _read(self, port: Port) -> None:
         """Until the device is gone or has been silent for too long."""
         heard = time.monotonic()
-        while not self._stop.wait(_BATCH_S):
+        # No pause to collect bytes: it would beat with the sample rate, and the least delay never be seen.
+        while not self._stop.is_set():
             try:
                 chunk = read_chunk(port)
             except (OSError, termios.error):

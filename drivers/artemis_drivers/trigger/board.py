@@ -237,7 +237,7 @@ class TriggerBoard:
         board_ns = self._clock.read(event.t_us, rx_ns)
         if self._clock.boot != boot:
             self._restarted()
-        count = counter.read(raw)
+        count = counter.read(raw, event.t_us)
         if count is None:
             return
         self._append(kind, count, rx_ns, counter.series, t_us=event.t_us, board_ns=board_ns, flags=flags)

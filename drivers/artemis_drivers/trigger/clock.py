@@ -58,14 +58,19 @@ class EventCounter:
     repeated: int = 0
     series: int = 0
     _last: int | None = None
+    _stamp: int | None = None
 
-    def read(self, raw: int) -> int | None:
-        """The unwrapped count within the series, or None for an event that has come already."""
+    def read(self, raw: int, stamp: int) -> int | None:
+        """The unwrapped count within the series, or None for an event that has come already.
+
+        ``stamp``: its capture; an event with the same count and another capture is another one.
+        """
         step = 1 if self._last is None else wrapped_step(self._last, raw, COUNT_MODULUS)
-        if step == 0:
+        if step == 0 and stamp == self._stamp:
             self.repeated += 1
             return None
-        if step < 0 or step > _MOST_LOST:
+        self._stamp = stamp
+        if step <= 0 or step > _MOST_LOST:
             self.restart()
         if self._last is None:
             self._last = raw
