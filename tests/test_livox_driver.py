@@ -19,7 +19,7 @@ from artemis_drivers.livox_avia.settings import AviaConfig, StoredExtrinsic
 from artemis_drivers.livox_host import LivoxHost
 from artemis_drivers.livox_mid360.driver import livox_driver
 from artemis_drivers.livox_slots import collect
-from artemis_drivers.ring import RingReader
+from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import Interface, interfaces, open_udp, port_holder, receive_buffer_warning
 from artemis_drivers.virtual.wire_avia import Faults, VirtualAvia
 from artemis_drivers.virtual.wire_clock import DeviceClock
@@ -27,8 +27,16 @@ from artemis_drivers.virtual.wire_stream import steady_imu, steady_shots
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests import livox_ports
+
 MS = 1_000_000
 SECOND = 1_000 * MS
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ports() -> Iterator[None]:
+    with livox_ports.reserved():
+        yield
 
 
 def until(condition: Callable[[], bool], seconds: float = 6.0) -> bool:
@@ -419,6 +427,8 @@ def test_kernel_drops_are_counted() -> None:
                 return one(driver).counters["kernel_drops"] > 0
 
             assert until(dropped)
+        stream(device, 0.5)  # the complaint about missing data goes before
+        assert until(lambda: "came faster than this computer" in one(driver).message)
 
 
 def test_own_interfaces() -> None:
@@ -429,6 +439,17 @@ def test_own_interfaces() -> None:
 def test_ports_of_several_lidars() -> None:
     spread = spread_ports([AviaConfig(name=str(k)) for k in range(3)])
     assert [(c.command_port, c.data_port) for c in spread] == [(55501, 56001), (55502, 56002), (55503, 56003)]
+
+
+def test_rings_of_the_callers_making() -> None:
+    made: dict[str, Ring] = {}
+
+    def make(name: str, dtype: np.dtype[np.void], slots: int) -> Ring:
+        made[name] = Ring(dtype, slots, memoryview(bytearray(Ring.nbytes(dtype, slots))))
+        return made[name]
+
+    lidar = livox_driver([AviaConfig(name="front")], make_ring=make).lidars[0]
+    assert made == {"front.packets": lidar.packets, "front.points": lidar.points, "front.imu": lidar.imu}
 
 
 def test_stop_without_device_and_twice() -> None:

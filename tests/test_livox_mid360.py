@@ -24,8 +24,16 @@ from artemis_drivers.virtual.wire_stream import steady_imu, steady_shots
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests import livox_ports
+
 MS = 1_000_000
 PERIOD = 480_000  # 96 points at 200 kHz
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ports() -> Iterator[None]:
+    with livox_ports.reserved():
+        yield
 
 
 def feed(packets: list[tuple[int, bytes]]) -> Decoder:
@@ -85,7 +93,7 @@ def test_frames_are_found_between_noise(parts: list[tuple[bytes, Frame]], tail: 
 
 
 @given(st.binary(max_size=1500))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_any_datagram_is_survived(data: bytes) -> None:
     protocol.decode(data)
     for reader in (

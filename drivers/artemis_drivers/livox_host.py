@@ -116,13 +116,13 @@ class LivoxLidar:
         arrived = 0
         for receiver in self._receivers:
             receiver.sender = self.session.device_ip or None
-            full = True
-            while full:
+            for _ in range(PACKET_SLOTS // _BATCH):  # a flood must not keep the session from speaking
                 first = self.packets.published
                 count = receiver.drain(_BATCH)
                 self.decoder.decode(first, count)
                 arrived += count
-                full = count == _BATCH
+                if count < _BATCH:
+                    break
         if arrived:
             self._last_data = now
             data_type, status_code, _ = self.decoder.latest()
@@ -148,11 +148,14 @@ class LivoxLidar:
         counters["packets_truncated"] = sum(r.truncated for r in receivers)
         counters["packets_foreign"] = sum(r.foreign for r in receivers)
         counters["host_clock_set"] = sum(r.clock_set for r in receivers)
+        slow = ""
+        if counters["kernel_drops"]:
+            slow = f"{counters['kernel_drops']} packets came faster than this computer took them: end other programs"
         clock = CLOCK_NAMES.get(self.decoder.latest()[2], "unknown")
         return Health(
             name=self.name,
             state=session.state,
-            message=session.message or self.warning,
+            message=session.message or slow or self.warning,
             counters=counters,
             last_data_ns=self._last_data,
             identity=session.identity(),
