@@ -4,9 +4,10 @@ Published: field of view 70.4 x 77.2 degrees in non-repetitive mode, 240 000 poi
 (livoxtech.com/avia/specs as quoted by public projects); six lasers fired in turn, so that the line is the
 point's number modulo 6 (Livox SDK 1 and its ROS driver). Not published by Livox: the optics. Wedges, rates and
 refractive index are those in the tests of PlantSimulationLab/Phytograph (backend, Livox rosette), which takes
-its other scanners from HELIOS++; through them one laser fills a circle of 70.42 degrees, which confirms them.
-That the six lasers differ in elevation only, evenly and by as much as makes the field 77.2 degrees high, is our
-assumption.
+its other scanners from HELIOS++. Two things confirm them: through them one laser fills a circle of 70.42
+degrees, and real frames of a one-laser Livox with that view move over it as these prisms make a beam move and
+as two prisms cannot (tests/bench/lidar_pattern.py). That the six lasers differ in elevation only, evenly and by
+as much as makes the field 77.2 degrees high, is our assumption.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ FRAME_S = 0.1
 LINES = 6
 FOV_HORIZONTAL = 70.4 * np.pi / 180
 FOV_VERTICAL = 77.2 * np.pi / 180
-_WEDGE = np.radians([30.8856, 29.7735, 3.1351])
-_RATE_HZ = np.array([-131.5463, 40.8032, 213.1611])
-_INDEX = 1.51
+WEDGE = np.radians([30.8856, 29.7735, 3.1351])
+RATE_HZ = np.array([-131.5463, 40.8032, 213.1611])
+INDEX = 1.51
 # elevation of the outer lasers before the prisms: with it the field is 77.2 degrees high behind them
 _OUTER = 3.08 * np.pi / 180
 
@@ -46,7 +47,7 @@ def direction(time_s: F64, line: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
     elevation = _OUTER * (2 * np.arange(LINES) / (LINES - 1) - 1)
     laser = np.column_stack([np.cos(elevation), np.zeros(LINES), np.sin(elevation)])
     out = np.empty((len(time_s), 3))
-    deflect(_WEDGE, _RATE_HZ, _INDEX, laser, line, np.asarray(time_s, np.float64), out)
+    deflect(WEDGE, RATE_HZ, INDEX, laser, line, np.asarray(time_s, np.float64), out)
     return out
 
 
