@@ -10,6 +10,7 @@ from ipaddress import IPv4Address, IPv4Network
 import numpy as np
 import pytest
 from artemis_drivers.base import DriverError, Health, State
+from artemis_drivers.livox import livox_driver
 from artemis_drivers.livox_avia.control import AviaSession
 from artemis_drivers.livox_avia.driver import spread_ports
 from artemis_drivers.livox_avia.items import command
@@ -17,7 +18,6 @@ from artemis_drivers.livox_avia.payloads import Broadcast
 from artemis_drivers.livox_avia.protocol import Frame, General, Kind, Lidar, WorkState, decode, encode
 from artemis_drivers.livox_avia.settings import AviaConfig, StoredExtrinsic
 from artemis_drivers.livox_host import LivoxHost
-from artemis_drivers.livox_mid360.driver import livox_driver
 from artemis_drivers.livox_slots import collect
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import Interface, interfaces, open_udp, port_holder, receive_buffer_warning
@@ -219,10 +219,10 @@ def test_reboot_is_noticed_and_recovered() -> None:
         stream(device, 3.0)
         assert until(lambda: one(driver).counters["points_packets"] > 100)
         device.reboot()
-        assert until(lambda: one(driver).state == State.SILENT, 1.0)
+        assert until(lambda: one(driver).state == State.SILENT)
         assert "no data" in one(driver).message
         before = one(driver).counters["points_packets"]
-        assert until(lambda: one(driver).counters["points_packets"] > before, 3.0)
+        assert until(lambda: one(driver).counters["points_packets"] > before)
         health = one(driver)
         assert health.counters["sessions"] == 2 and health.state == State.RUNNING and health.message == ""
         assert health.counters["points_clock_steps"] == 1 and health.counters["points_lost"] == 0
@@ -235,21 +235,18 @@ def test_cable_out_and_in_again(out_s: float) -> None:
         stream(device, out_s + 3)
         assert until(lambda: one(driver).counters["points_packets"] > 100)
         device.faults.unplugged = True
-        assert until(lambda: one(driver).state == State.SILENT, 1.0)
+        assert until(lambda: one(driver).state == State.SILENT)
         time.sleep(out_s - 0.6)
         assert one(driver).state == (State.SILENT if out_s < 3 else State.SEARCHING)
         assert "cable" in one(driver).message
         device.faults.unplugged = False
-        assert until(
-            lambda: (
-                one(driver).state == State.RUNNING
-                and time.monotonic_ns() - one(driver).last_data_ns < 50 * MS
-            ),
-            3,
-        )
-        lost = one(driver).counters["points_lost"]
-        assert lost == device.counters["packets_unplugged"] - one(driver).counters["imu_lost"]
-        assert lost == pytest.approx(out_s * 2500, rel=0.25)
+        assert until(lambda: one(driver).state == State.RUNNING)
+
+        def missed() -> int:
+            return one(driver).counters["points_lost"] + one(driver).counters["imu_lost"]
+
+        # every packet that was not sent is missed, and no other
+        assert until(lambda: missed() == device.counters["packets_unplugged"] > 1000)
         assert one(driver).counters["points_clock_steps"] == 0
 
 
@@ -477,6 +474,29 @@ EVENTS = st.one_of(
     st.tuples(st.just("utc"), st.integers(0, 10**9)),
     st.tuples(st.just("stop"), st.just(0)),
 )
+
+
+def test_unplugging_is_noticed_within_a_second_and_mended_within_three() -> None:
+    here = [Interface("eth0", IPv4Address("192.168.1.50"), IPv4Network("192.168.1.0/24"))]
+    session = AviaSession(AviaConfig(), lambda: here)
+    out, back = 20_000, 24_000  # ms
+    states: dict[int, State] = {}
+    session.start(0)
+    for ms in range(0, 30_000, 5):
+        now, plugged = ms * MS, not out <= ms < back
+        if plugged and ms % 1000 == 0 and session.counters["sessions"] == 0:
+            session.hear_broadcast(Broadcast("3JEDK1E001F6361", 7), "192.168.1.10", now)
+        if plugged and session.state in (State.RUNNING, State.SILENT):
+            session.data_seen(now, 2, 0)
+        session.tick(now)
+        for datagram in session.outbox if plugged else ():
+            frame = decode(datagram.data)[0][0]
+            answer = frame._replace(kind=Kind.ACK, payload=bytes([0, 1, 0, 0, 0, 0, 0]))
+            session.hear(encode(answer), "192.168.1.10", now)
+        session.outbox.clear()
+        states[ms] = session.state
+    assert states[out - 5] == State.RUNNING and states[out + 1000] == State.SILENT
+    assert states[back - 5] == State.SEARCHING and states[back + 3000] == State.RUNNING
 
 
 @given(st.lists(EVENTS, max_size=60))

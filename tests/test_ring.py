@@ -65,6 +65,18 @@ def test_slots_claimed_while_reading_are_discarded() -> None:
     assert (first, got["number"].tolist(), reader.lost) == (2, [2, 3], 2)
 
 
+def test_lapsed_claims_cost_no_slot_but_touched_ones_do() -> None:
+    for touched, expected in ((0, [1, 2, 3, 4]), (2, [2, 3, 4]), (9, [3, 4])):
+        ring = Ring(SLOT, 4)
+        _put(ring, 4)
+        ring.claim(3)
+        ring.field["number"][0] = 4
+        ring.publish(1, touched=touched)
+        reader = RingReader(ring, from_oldest=True)
+        assert reader.read()[1]["number"].tolist() == expected and reader.lost == 0
+        assert ring.claim(0) == 5 and RingReader(ring, from_oldest=True).next == expected[0]
+
+
 def test_unused_claims_are_given_back() -> None:
     ring = Ring(SLOT, 4)
     assert ring.claim(3) == 0

@@ -66,15 +66,21 @@ class Ring:
             raise ValueError(f"cannot claim {count} of {self.slots} slots")
         first = self.published
         with self._fence:
-            self._head[_CLAIMED] = first + count
+            self._head[_CLAIMED] = max(int(self._head[_CLAIMED]), first + count)
         return first
 
-    def publish(self, count: int) -> None:
-        """Give the first ``count`` claimed slots to the readers."""
-        if not 0 <= count <= int(self._head[_CLAIMED]) - self.published:
+    def publish(self, count: int, *, touched: int = 0) -> None:
+        """Give the first ``count`` claimed slots to the readers; the other claims lapse.
+
+        ``touched``: how many of the claimed slots were written to, when that is more than are published.
+        """
+        first = self.published
+        claimed = int(self._head[_CLAIMED])
+        if not 0 <= count <= claimed - first:
             raise ValueError(f"cannot publish {count} slots that were not claimed")
         with self._fence:
-            self._head[_PUBLISHED] += count
+            self._head[_PUBLISHED] = first + count
+            self._head[_CLAIMED] = min(claimed, first + max(count, touched))
 
     def append(self, values: Mapping[str, Any]) -> None:
         """Write and publish one slot (for slow streams; fast ones claim, fill and publish many)."""

@@ -159,7 +159,7 @@ class PacketReceiver:
             else:
                 size[row] = n
                 count += 1
-        ring.publish(count)
+        ring.publish(count, touched=count + 1)  # a datagram not taken lies in the next slot
         return count
 
     def _stamp(self, ancillary: list[tuple[int, int, bytes]]) -> int:

@@ -18,10 +18,10 @@ from multiprocessing.synchronize import Event
 
 import numpy as np
 from artemis_drivers.base import State
+from artemis_drivers.livox import livox_driver
 from artemis_drivers.livox_avia import encode
 from artemis_drivers.livox_avia.points import SHOTS, Decoder
 from artemis_drivers.livox_avia.settings import AviaConfig
-from artemis_drivers.livox_mid360.driver import livox_driver
 from artemis_drivers.livox_slots import IMU_SLOT, POINT_SLOT, collect
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import PACKET

@@ -1,4 +1,4 @@
-"""Driver of one or several Livox Avia."""
+"""Discovery and assembly of Livox Avias for the driver (livox.py)."""
 
 from __future__ import annotations
 

@@ -1,13 +1,11 @@
-"""Driver of one or several Livox Mid-360, and of a rig that has Avias as well."""
+"""Discovery and assembly of Livox Mid-360 for the driver (livox.py)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from artemis_drivers.livox_avia.driver import AviaFinder, avia_lidar, spread_ports
-from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.livox_dialogue import MS, Datagram
-from artemis_drivers.livox_host import Finder, LivoxHost, LivoxLidar, Ports, check_lidars, rings
+from artemis_drivers.livox_host import LivoxLidar, Ports, rings
 from artemis_drivers.livox_mid360.control import Mid360Session
 from artemis_drivers.livox_mid360.points import Decoder
 from artemis_drivers.livox_mid360.protocol import DISCOVERY_PORT, Cmd, Found, Frame, decode, encode
@@ -58,27 +56,3 @@ def mid360_lidar(
     session = Mid360Session(config, own_addresses)
     ports = Ports((config.command_port, config.push_port), (config.point_port, config.imu_port))
     return LivoxLidar(config.name, ports, session, Decoder(*rings(config.name, make_ring))), session
-
-
-def livox_driver(
-    avias: Sequence[AviaConfig] = (),
-    mid360s: Sequence[Mid360Config] = (),
-    *,
-    own_addresses: Callable[[], list[Interface]] = interfaces,
-    search_address: str = EVERYBODY,
-    make_ring: RingMaker = private_ring,
-) -> LivoxHost:
-    """Driver of all Livox LiDARs of a rig; ``make_ring`` may put their rings into shared memory.
-
-    Raises DriverError when two configurations contradict each other.
-    """
-    first = [avia_lidar(c, own_addresses, make_ring) for c in spread_ports(avias)]
-    second = [mid360_lidar(c, own_addresses, make_ring) for c in mid360s]
-    lidars = [lidar for lidar, _ in first] + [lidar for lidar, _ in second]
-    check_lidars(lidars)
-    finders: list[Finder] = []
-    if first:
-        finders.append(AviaFinder([session for _, session in first]))
-    if second:
-        finders.append(Mid360Finder([session for _, session in second], search_address))
-    return LivoxHost(lidars, finders)
