@@ -14,7 +14,7 @@ from artemis_drivers.livox import livox_driver
 from artemis_drivers.livox_avia.control import AviaSession
 from artemis_drivers.livox_avia.driver import spread_ports
 from artemis_drivers.livox_avia.items import command
-from artemis_drivers.livox_avia.payloads import Broadcast
+from artemis_drivers.livox_avia.payloads import Broadcast, encode_utc
 from artemis_drivers.livox_avia.protocol import Frame, General, Kind, Lidar, WorkState, decode, encode
 from artemis_drivers.livox_avia.settings import AviaConfig, StoredExtrinsic
 from artemis_drivers.livox_host import LivoxHost
@@ -456,7 +456,11 @@ def test_stop_without_device_and_twice() -> None:
     driver.stop()
     driver.stop()
     assert one(driver).state == State.STOPPED
-    driver.lidars[0].send_utc(0)
+    for wrong in (0, 946_684_800 * SECOND - 1, 9_025_257_600 * SECOND):
+        with pytest.raises(ValueError, match="2000 to 2255"):
+            driver.lidars[0].send_utc(wrong)
+    assert encode_utc(946_684_800 * SECOND)[:4] == bytes([0, 1, 1, 0])
+    assert encode_utc(9_025_257_600 * SECOND - 1)[:4] == bytes([255, 12, 31, 23])
 
 
 # -- the session alone, in simulated time -----------------------------------------------------------------------

@@ -24,6 +24,7 @@ from artemis_drivers.udp import PACKET, RECEIVE_BUFFER, PacketReceiver, open_udp
 POLL_S = 0.004  # 10 packets of an Avia; the kernel has stamped them on arrival
 _BATCH = 256
 _STOP_S = 1.5
+_UTC_FIRST, _UTC_END = 946_684_800 * 10**9, 9_025_257_600 * 10**9  # years 2000 to 2255, ns since 1970
 PACKET_SLOTS = 8192  # 3.3 s of single returns, 1 s of triple returns
 IMU_SLOTS = 2048
 
@@ -108,7 +109,12 @@ class LivoxLidar:
             sock.close()
 
     def send_utc(self, unix_ns: int) -> None:
-        """Ask that the PPS edge just passed be named ``unix_ns``; callable from any thread."""
+        """Ask that the PPS edge just passed be named ``unix_ns``; callable from any thread.
+
+        Raises ValueError for times that the protocol cannot express.
+        """
+        if not _UTC_FIRST <= unix_ns < _UTC_END:
+            raise ValueError(f"{unix_ns} ns since 1970 is outside the years 2000 to 2255")
         self._utc.put(unix_ns)
 
     def receive(self, now: int) -> None:
