@@ -65,6 +65,7 @@ class EnvelopeFit:
         self._max_skew = max_skew_ppm * PPM
         self._bins: deque[_Bin] = deque()
         self._model: AffineClock | None = None
+        self._skew: float | None = None
         self._stale = False
         self.ignored = 0
 
@@ -87,23 +88,28 @@ class EnvelopeFit:
         if self._model is not None and y_ns < self._model.to_y(x_ns):
             self._stale = True
 
-    def model(self) -> AffineClock | None:
-        """The line, or None before the first event."""
+    @property
+    def span_s(self) -> float:
+        """Device time from the first to the last event, s."""
+        return (self._bins[-1].x - self._bins[0].x) / SECOND_NS if self._bins else 0.0
+
+    def model(self, skew: float | None = None) -> AffineClock | None:
+        """The line, or None before the first event. ``skew``: known from elsewhere, only the offset is sought."""
         if not self._bins:
             return None
-        if self._stale or self._model is None:
-            self._model = lower_line(*self._points(), self._max_skew)
+        if self._stale or self._model is None or skew != self._skew:
+            self._model = lower_line(*self._points(), self._max_skew, skew)
+            self._skew = skew
             self._stale = False
         return self._model
 
     def quality(self) -> FitQuality:
-        """How well the line is supported."""
-        model = self.model()
+        """How well the latest line is supported."""
+        model = self.model(self._skew)
         if model is None:
             return FitQuality(0.0, 0, 0)
         delays = [bin_.y - model.to_y(bin_.x) for bin_ in self._bins]
-        span = (self._bins[-1].x - self._bins[0].x) / SECOND_NS
-        return FitQuality(span, sum(bin_.events for bin_ in self._bins), int(np.median(delays)))
+        return FitQuality(self.span_s, sum(bin_.events for bin_ in self._bins), int(np.median(delays)))
 
     def restart(self) -> None:
         """Forget everything: one of the clocks began anew."""
@@ -129,22 +135,30 @@ class _Bin:
             self.x, self.y = x, y
 
 
-def lower_line(x: list[int], y: list[int], max_skew: float) -> AffineClock:
-    """The line below all points (int nanoseconds, ascending x) that is nearest to them at mid-span."""
+def lower_line(x: list[int], y: list[int], max_skew: float, skew: float | None = None) -> AffineClock:
+    """The line below all points (int nanoseconds, ascending x) that is nearest to them at mid-span.
+
+    With ``skew`` given, the highest line of that slope.
+    """
     x0, y0 = x[0], y[0]
     # differences are small enough for float64: a day of nanoseconds is exact to 0.01 ns
     along: F64 = np.array([value - x0 for value in x], np.float64)
     delay: F64 = np.array([b - y0 - (a - x0) for a, b in zip(x, y, strict=True)], np.float64)
-    hull = _lower_hull(along, delay)
-    slope = 0.0
-    if len(hull) > 1:
-        middle = 0.5 * (along[0] + along[-1])
-        right = next(k for k in range(1, len(hull)) if along[hull[k]] >= middle)
-        a, b = hull[right - 1], hull[right]
-        slope = float((delay[b] - delay[a]) / (along[b] - along[a]))
+    slope = _edge_slope(along, delay) if skew is None else skew
     slope = min(max(slope, -max_skew), max_skew)
     offset = float(np.min(delay - slope * along))
     return AffineClock(x0, y0 + round(offset), slope)
+
+
+def _edge_slope(along: F64, delay: F64) -> float:
+    """Slope of the lower hull's edge at mid-span; 0 for a single point."""
+    hull = _lower_hull(along, delay)
+    if len(hull) < 2:
+        return 0.0
+    middle = 0.5 * (along[0] + along[-1])
+    right = next(k for k in range(1, len(hull)) if along[hull[k]] >= middle)
+    a, b = hull[right - 1], hull[right]
+    return float((delay[b] - delay[a]) / (along[b] - along[a]))
 
 
 def _lower_hull(x: F64, y: F64) -> list[int]:

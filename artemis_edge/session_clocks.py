@@ -103,6 +103,11 @@ class PulseClock:
         """Session time at a board time; None before the first pulse."""
         return None if self._model is None else self._model.to_y(board_ns)
 
+    @property
+    def skew(self) -> float | None:
+        """Session seconds a board second, minus one; None before the first pulse."""
+        return None if self._model is None else self._model.skew
+
     def missing_ns(self, board_ns: int) -> int:
         """How long the pulse has been missing; 0 while it comes."""
         if not self._pulses:

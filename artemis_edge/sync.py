@@ -31,6 +31,7 @@ from artemis_edge.session_clocks import (
 )
 
 _US_NS = 1000
+_SLOPE_S = 3.0  # of LiDAR stamps that give a better slope than the board's messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,7 @@ class Synchroniser:
             name: FramePairing(timing, self.history, self._board_of_host) for name, timing in cameras.items()
         }
         self._host = EnvelopeFit()  # x: board, y: host
+        self._by_lidar = EnvelopeFit()  # x: session, y: host
         self._imus = {name: _Imu(latency) for name, latency in imu_latency_ns.items()}
         self._lidars: dict[str, LidarTime] = {}
         self._boot: int | None = None
@@ -134,7 +136,7 @@ class Synchroniser:
         if session is None or board_ns is None:
             self.undated[name] += 1
             return None
-        span = min(self._host.quality().span_s, imu.fit.quality().span_s)
+        span = min(self._host.span_s, imu.fit.span_s)
         state = ClockState.LOCKED if span >= SETTLED_S else ClockState.SETTLING
         if state == ClockState.LOCKED and self.pulse.missing_ns(board_ns):
             state = ClockState.HOLDOVER
@@ -154,7 +156,10 @@ class Synchroniser:
             return None
         present = pulse if pulse is not None else not self.pulse.missing_ns(board_ns)
         lidar = self._lidars.setdefault(name, LidarTime(name))
-        return lidar.stamp(stamp_ns, clock, arrival, pulse=present)
+        dated = lidar.stamp(stamp_ns, clock, arrival, pulse=present)
+        if dated.state == ClockState.LOCKED and name == next(iter(self._lidars)):
+            self._by_lidar.add(dated.stamp_ns, rx_ns)
+        return dated
 
     def arm(self, sequences: Mapping[str, int], count: int = 0) -> None:
         """Triggers stand still: trigger ``count`` of the next series belongs to these frames of the cameras."""
@@ -205,6 +210,7 @@ class Synchroniser:
             self.pulse.restart(self.session_of_host(event.rx_ns))
         self._boot = event.boot
         self._host.restart()
+        self._by_lidar.restart()
         self._new_series(event.series)
 
     def _new_series(self, series: int) -> None:
@@ -215,8 +221,19 @@ class Synchroniser:
                 pairing.unanchor()
 
     def _board_of_host(self, host_ns: int) -> int | None:
-        model = self._host.model()
+        model = self._host.model(self._skew_by_lidar())
         return None if model is None else model.to_x(host_ns)
+
+    def _skew_by_lidar(self) -> float | None:
+        """Host seconds a board second, minus one, by a LiDAR with pulse; None while there is none.
+
+        Its stamps are session time and come by the hundred, the board's messages by the dozen a second: the
+        slope is the LiDAR's, which leaves only the offset to the board's.
+        """
+        skew, model = self.pulse.skew, self._by_lidar.model()
+        if skew is None or model is None or self._by_lidar.span_s < _SLOPE_S:
+            return None
+        return (1 + skew) * (1 + model.skew) - 1
 
     def _report_fit(self, name: str, fit: EnvelopeFit) -> ClockReport:
         model, quality = fit.model(), fit.quality()

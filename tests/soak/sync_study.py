@@ -67,7 +67,8 @@ def main() -> int:
     parser.add_argument("--only", choices=list(TROUBLES))
     options = parser.parse_args()
     names = [options.only] if options.only else list(TROUBLES)
-    return 0 if all([study(name, options.runs, options.seconds) for name in names]) else 1
+    good = [study(name, options.runs, options.seconds) for name in names]
+    return 0 if all(good) else 1
 
 
 if __name__ == "__main__":
