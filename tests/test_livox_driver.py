@@ -141,6 +141,20 @@ def test_other_data_types_on_the_wire(mode: str, coordinate: str, data_type: int
         )
 
 
+def test_device_that_streams_while_it_is_configured() -> None:
+    device = quick()
+    with device:
+        stream(device, 4.0, returns=3)
+        driver = livox_driver([AviaConfig(return_mode="triple")])
+        driver.start()
+        try:
+            assert until(lambda: one(driver).counters["points_packets"] > 1000)
+            got = RingReader(driver.lidars[0].points, from_oldest=True).read()[1]
+            assert set(got["data_type"].tolist()) == {7} and one(driver).counters["points_lost"] == 0
+        finally:
+            driver.stop()
+
+
 def test_lost_doubled_and_packed_replies() -> None:
     device = quick(faults=Faults(seed=3, lose_replies=0.2, duplicate_replies=0.3))
     driver = livox_driver([AviaConfig()])

@@ -364,10 +364,11 @@ class VirtualAvia:
                 data = encode.imu_packet(self._status(), clock, stamp, what.gyro, what.accel)
                 self._send_data(_IMU_PORT, data, host.sensor_port)
             return
-        clock, stamp = self.device_time.stamp(what.start_ns)
         data_type = self._data_type()
-        head = encode.header(self._status(), clock, data_type, stamp)
-        self._send_data(_POINT_PORT, head + body(data_type, what), host.data_port)
+        for _, part in self._cut(what):  # once more: the return mode may have been changed since
+            clock, stamp = self.device_time.stamp(part.start_ns)
+            head = encode.header(self._status(), clock, data_type, stamp)
+            self._send_data(_POINT_PORT, head + body(data_type, part), host.data_port)
 
     def _send_data(self, source_port: int, data: bytes, port: int) -> None:
         draw = self._random.random(3)
