@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from artemis_drivers.virtual import avia, mid360, street
-from artemis_drivers.virtual.echo import Receiver, empty_echoes, receive, seen_m
+from artemis_drivers.virtual.echo import Receiver, empty_echoes, receive, returned_light, seen_m
 from artemis_drivers.virtual.footprint import LANES, Spots, fan_out, lane_offsets
 from artemis_drivers.virtual.lidar import Beams, Frame, LidarSpec, _jittered, poses_at, range_sigma, scan
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder, WorldMesh
@@ -15,12 +15,14 @@ from artemis_drivers.virtual.motion import Motion, rotation
 from artemis_drivers.virtual.moving import near_mover
 from artemis_drivers.virtual.prisms import deflect, refract
 from artemis_drivers.virtual.scene import Scene, Window, cast_at, local_rays, prepare
-from artemis_drivers.virtual.sensors import LIDARS
+from artemis_drivers.virtual.lidars import LIDARS
+from artemis_drivers.virtual.shading import sample
 from artemis_drivers.virtual.shapes import box
 from artemis_drivers.virtual.textures import TextureAtlas, build_atlas
 from artemis_drivers.virtual.world import Mover
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 IDEAL = LidarSpec(
     range_noise_m=0.0, angular_noise=0.0, divergence_vertical=0.0, divergence_horizontal=0.0, fading=0.0
@@ -199,6 +201,29 @@ def test_spots_agree_with_single_rays(busy: Scene) -> None:
     assert len(np.unique(spots.triangle)) > 8 and (spots.triangle[:, 0] != spots.triangle[:, 7]).any()
 
 
+def test_spots_know_what_picture_they_met_and_how_much_light_returns(busy: Scene) -> None:
+    """Slow twin of _surface_met and _light."""
+    origin, direction, time = random_rays(60, 6)
+    fan = np.empty((60, 3, LANES), np.float32)
+    fan_out(direction, np.stack([np.eye(3)] * 60), lane_offsets(0.001, 0.001), fan)
+    spots = Spots(busy, origin, fan, time, 100.0)
+    arrays = busy.atlas.arrays
+    light = returned_light(busy, spots)
+    for i, k in np.argwhere(spots.triangle >= 0)[::7]:
+        t = spots.triangle[i, k]
+        ray = fan[i, :, k].astype(np.float64)
+        point = origin[i] + spots.distance[i, k] * ray
+        local, _ = local_rays(busy, np.array([t]), point[None], ray[None], time[i : i + 1])
+        row = busy.surface.rows[t].astype(np.float64)
+        u, v = row[4:7] @ local[0] + row[7], row[8:11] @ local[0] + row[11]
+        np.testing.assert_allclose(spots.texture[i, k], [u, v], atol=2e-4)
+        m = busy.surface.look[t, 3]
+        rgb = sample(arrays.texels, arrays.start, m, u, v, 3.0)
+        rho = arrays.reflectivity[m] * (0.5 + 0.5 * np.mean(rgb) / arrays.mean_luma[m])
+        # lanes of one triangle share the picture of the first
+        assert light[i, k] == pytest.approx(rho * spots.cosine[i, k], rel=0.1)
+
+
 def test_spots_of_a_street_agree_with_single_rays(atlas: TextureAtlas) -> None:
     world = street.build(3, 60.0, atlas)
     scene = Window(world, 60.0).at(20.0)
@@ -242,8 +267,9 @@ def mixed_point_model(distance: F64, light: F64, plane: F64, gap: float) -> list
             groups.append([k])
     out = []
     for g in groups:
-        mean = np.average(distance[g], weights=light[g])
-        spread = np.sqrt(np.average((distance[g] - mean) ** 2, weights=light[g]))
+        received = light[g] / distance[g] ** 2
+        mean = np.average(distance[g], weights=received)
+        spread = np.sqrt(np.average((distance[g] - mean) ** 2, weights=received))
         out.append((float(mean), float(spread), float(light[g].sum() / len(distance))))
     return out
 
@@ -547,6 +573,34 @@ def test_prisms_agree_with_snells_law_in_vectors() -> None:
         assert np.linalg.norm(out) == pytest.approx(1.0)
         assert np.linalg.norm(np.cross(n, out)) * 1.51 == pytest.approx(np.linalg.norm(np.cross(n, d)))
         assert abs(np.dot(np.cross(n, d), out)) < 1e-12 and out @ d > 0
+
+
+def test_deflect_agrees_with_surfaces_one_by_one() -> None:
+    """Slow twin: every face as a rotated normal, Snell's law with angles."""
+    rng = np.random.default_rng(1)
+    wedge, rate, time = np.array([0.3, 0.2, 0.05]), np.array([-90.0, 41.0, 200.0]), rng.uniform(0, 1, 60)
+    laser = np.array([[1.0, 0.0, 0.0], [np.cos(0.05), 0.0, np.sin(0.05)]])
+    which = rng.integers(0, 2, 60)
+    out = np.empty((60, 3))
+    deflect(wedge, rate, 1.51, laser, which, time, out)
+    for t, w, got in zip(time, which, out, strict=True):
+        d = laser[w]
+        for slope, turns in zip(wedge, rate, strict=True):
+            tilted = Rotation.from_rotvec([2 * np.pi * turns * t, 0, 0]).apply(
+                [np.cos(slope), np.sin(slope), 0]
+            )
+            d = bent(bent(d, tilted, 1.0, 1.51), np.array([1.0, 0, 0]), 1.51, 1.0)
+        np.testing.assert_allclose(got, d, atol=1e-12)
+
+
+def bent(d: F64, along: F64, index_from: float, index_to: float) -> F64:
+    """Refraction by turning the ray within the plane of incidence; ``along`` is the normal it goes along."""
+    axis = np.cross(along, d)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-15:
+        return d
+    angle = np.arcsin(index_from / index_to * sine)
+    return np.asarray(Rotation.from_rotvec(axis / sine * angle).apply(along))
 
 
 def test_prisms_with_published_figures_fill_the_published_field_of_view() -> None:

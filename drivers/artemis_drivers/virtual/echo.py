@@ -1,7 +1,7 @@
 """Echoes: what a receiver makes of the light that a beam's spot sends back.
 
 The lanes of a spot, sorted by distance, are one echo while they lie on one plane or within the pulse's range
-resolution of each other: their ranges mix, weighted by the light they return, and a point appears where
+resolution of each other: their ranges mix, weighted by the light that arrives, and a point appears where
 nothing is. Further apart they are echoes of their own. An echo is seen when its light, expressed as the
 reflectivity of a wall that fills the spot squarely, suffices at its range; a sensor reports its strongest
 echoes.
@@ -63,11 +63,17 @@ class Echoes(NamedTuple):
 
 def echoes(scene: Scene, spots: Spots, receiver: Receiver, fading: F64) -> Echoes:
     """Echoes of a scan's spots; ``fading`` float64 (n,) scales the range at which each beam still sees."""
-    light = np.zeros(spots.distance.shape, np.float32)
-    _light(spots.triangle, spots.cosine, spots.texture, scene.surface, scene.atlas.arrays, light)
+    light = returned_light(scene, spots)
     out = empty_echoes(len(light))
     receive(spots.distance, spots.triangle, light, scene.surface.key, receiver, fading, out)
     return out
+
+
+def returned_light(scene: Scene, spots: Spots) -> F32:
+    """Light (n, lanes) that each lane returns against that of a white wall; 0 where it met nothing."""
+    light = np.zeros(spots.distance.shape, np.float32)
+    _light(spots.triangle, spots.cosine, spots.texture, scene.surface, scene.atlas.arrays, light)
+    return light
 
 
 def empty_echoes(beams: int) -> Echoes:
@@ -135,21 +141,24 @@ def _sort_lanes(distance: F32, order: I32) -> int:
 @njit
 def _mix(distance: F32, light: F32, order: I32, start: int, stop: int) -> tuple[float, float, float, int]:
     """Mean range, spread, light (of the whole spot) and representative lane of sorted lanes start..stop."""
-    total, mean = 0.0, 0.0
+    total, weight, mean = 0.0, 0.0, 0.0
     for j in range(start, stop):
-        total += light[order[j]]
-        mean += light[order[j]] * distance[order[j]]
-    mean /= max(total, 1e-30)
+        k = order[j]
+        received = light[k] / distance[k] ** 2
+        total += light[k]
+        weight += received
+        mean += received * distance[k]
+    mean /= max(weight, 1e-30)
     spread, best, nearest = 0.0, order[start], np.inf
     middle = 0.5 * (len(distance) - 1)
     for j in range(start, stop):
         k = order[j]
-        spread += light[k] * (distance[k] - mean) ** 2
+        spread += light[k] / distance[k] ** 2 * (distance[k] - mean) ** 2
         # the lane nearest to the beam's axis on the surface that the mixed range is nearest to
         off = abs(distance[k] - mean) + 1e-4 * abs(k - middle)
         if off < nearest:
             best, nearest = k, off
-    return mean, np.sqrt(spread / max(total, 1e-30)), total / len(distance), best
+    return mean, np.sqrt(spread / max(weight, 1e-30)), total / len(distance), best
 
 
 @njit
