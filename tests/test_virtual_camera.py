@@ -387,7 +387,7 @@ def test_exposure_follows_the_light_after_its_delay() -> None:
     assert used[13] > 1.5 * used[9]
     assert means[29] == pytest.approx(spec.target, rel=0.1)
     exposures = [control._split(p) for p in (1e-6, 0.004, 0.02, 10.0)]
-    assert exposures == [(0.00005, 1.0), (0.004, 1.0), (0.008, 2.5), (0.008, 8.0)]
+    assert exposures == [(0.00005, 1.0), (0.004, 1.0), (0.005, 4.0), (0.005, 8.0)]
 
 
 def test_manual_exposure_stays() -> None:

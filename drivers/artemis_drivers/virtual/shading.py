@@ -109,7 +109,8 @@ def _bilinear(texels: I32, first: int, size: int, u: float, v: float) -> Vector:
     mask = size - 1
     column, row = column >> _STEP_BITS, row >> _STEP_BITS
     left, right = column & mask, (column + 1) & mask
-    upper, lower = first + (row & mask) * size, first + ((row + 1) & mask) * size
+    upper, lower = np.uint64(first + (row & mask) * size), np.uint64(first + ((row + 1) & mask) * size)
+    left, right = np.uint64(left), np.uint64(right)  # unsigned: no test for counting from the end
     gx, gy = _STEPS - fx, _STEPS - fy
     total = _lanes(texels[upper + left]) * (gx * gy) + _lanes(texels[upper + right]) * (fx * gy)
     total += _lanes(texels[lower + left]) * (gx * fy) + _lanes(texels[lower + right]) * (fx * fy)
