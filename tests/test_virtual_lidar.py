@@ -10,12 +10,12 @@ from artemis_drivers.virtual import avia, mid360, street
 from artemis_drivers.virtual.echo import Receiver, empty_echoes, receive, returned_light, seen_m
 from artemis_drivers.virtual.footprint import LANES, Spots, fan_out, lane_offsets
 from artemis_drivers.virtual.lidar import Beams, Frame, LidarSpec, _jittered, poses_at, range_sigma, scan
+from artemis_drivers.virtual.lidars import LIDARS
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder, WorldMesh
 from artemis_drivers.virtual.motion import Motion, rotation
 from artemis_drivers.virtual.moving import near_mover
 from artemis_drivers.virtual.prisms import deflect, refract
 from artemis_drivers.virtual.scene import Scene, Window, cast_at, local_rays, prepare
-from artemis_drivers.virtual.lidars import LIDARS
 from artemis_drivers.virtual.shading import sample
 from artemis_drivers.virtual.shapes import box
 from artemis_drivers.virtual.textures import TextureAtlas, build_atlas

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from artemis_drivers.virtual import avia
 from artemis_drivers.virtual.lidar import Sensor
+from artemis_drivers.virtual.lidars import LIDARS
 from artemis_drivers.virtual.mesh_builder import F64
 from artemis_drivers.virtual.prisms import deflect
-from artemis_drivers.virtual.lidars import LIDARS
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
