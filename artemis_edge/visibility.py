@@ -1,16 +1,15 @@
 """Free space: what a later scan looks through is not surface any more.
 
-A scan becomes a cube of six range images holding the nearest range of each pixel and its eight neighbours, so
-that an edge seen a pixel aside protects the surface behind it. A vertex well in front of that range was looked
-through; one at that range is confirmed. Both are counted, and the vertex is carved when looks through it
-outweigh the confirmations: a car that drove on, a mixed point between two surfaces.
+A vertex well in front of what a scan saw in its direction (range_cube.py) was looked through; one at that range
+is confirmed. Both are counted, and the vertex is carved when looks through it outweigh the confirmations: a car
+that drove on, a mixed point between two surfaces.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from artemis_edge import block_store as bs
@@ -31,28 +30,11 @@ from artemis_edge.block_store import (
     Store,
 )
 from artemis_edge.config import VoxelMapConfig
-from artemis_edge.frames import F32, F64, DeskewedScan, TrackedFrame
+from artemis_edge.frames import F32, F64, I32, DeskewedScan, TrackedFrame
+from artemis_edge.range_cube import FAR, PIXELS, SPREAD, TILE, RangeCube, Rays, look_up, new_rays, pixel
 from artemis_edge.voxel_map import AT_ONCE, VoxelMap, is_seen_through
 
-PIXELS = 256  # a face; 0.45 degrees a pixel in its middle, the line spacing of common LiDARs
-FAR = np.float32(1.0e6)
 EVERY = 2  # frames between two judgements; each takes every second block
-
-
-class RangeCube:
-    """Nearest range seen in every direction from one scan's origin; memory is reused."""
-
-    def __init__(self) -> None:
-        self._raw = np.empty((6, PIXELS, PIXELS), np.float32)
-        self.range_m = np.empty_like(self._raw)
-        self._window = np.ones((3, 3), np.uint8)
-
-    def look(self, scan: DeskewedScan) -> None:
-        """Fill the cube from a scan, in the axes of the lidar frame around the scan's origin."""
-        self._raw.fill(FAR)
-        fill_cube(scan.points, scan.origin, self._raw)
-        for face in range(6):
-            cv2.erode(self._raw[face], self._window, dst=self.range_m[face])
 
 
 class FreeSpace:
@@ -62,6 +44,10 @@ class FreeSpace:
         self._config = config
         self._map = voxel_map
         self._cube = RangeCube()
+        self._rules = CarveRules(
+            voxel_map.block_m, config.free_space_range_m, config.voxel_m, config.free_space_slope
+        )
+        self._candidates = new_candidates()
 
     def carve(self, frame: TrackedFrame, stamp: int) -> int:
         """Count looks through and confirmations of a frame; returns how many vertices were carved."""
@@ -69,152 +55,197 @@ class FreeSpace:
         if self._config.free_space and stamp % EVERY == 0:
             for scan in frame.scans:
                 self._cube.look(scan)
-                gone += carve(
-                    self._map.store,
-                    self._cube.range_m,
-                    frame.T_world_lidar,
-                    scan.origin,
-                    self._map.block_m,
-                    self._config.free_space_range_m,
-                    self._config.voxel_m,
-                    self._config.free_space_slope,
-                    stamp,
-                )
+                gone += carve(self._map.store, self._view(frame, scan), self._rules, stamp, self._candidates)
         return gone
 
+    def _view(self, frame: TrackedFrame, scan: DeskewedScan) -> View:
+        R, t = frame.T_world_lidar[:3, :3], frame.T_world_lidar[:3, 3]
+        centre, cube = R @ scan.origin + t, self._cube
+        return View(np.ascontiguousarray(R.T), centre, cube.range_m.reshape(-1, PIXELS), cube.farthest_m)
+
+
+class View(NamedTuple):
+    """Where one scan was taken, and what it saw."""
+
+    R_lidar_world: F64  # (3, 3)
+    centre: F64  # (3,) of the scan's origin, world
+    range_m: F32  # (6 * PIXELS, PIXELS)
+    farthest_m: F32  # (6, TILES, TILES)
+
+
+class CarveRules(NamedTuple):
+    """How looks are judged; lengths in metres."""
+
+    block_m: float
+    reach_m: float
+    margin_m: float
+    slope: float
+
+
+class Candidates(NamedTuple):
+    """Scratch of ``carve``: the cells of one block."""
+
+    corner_of: I32  # (512,) voxels
+    corner: F64  # (512, 3) from the scan's origin, world axes [m]
+    slot: I32  # (n,) cells
+    voxel: I32  # (n,) of each cell
+    place: (
+        F32  # (3, n) of the cell's centre, then of its points' mean, from the scan's origin, world axes [m]
+    )
+    total: F32  # (3, n) sum over the cell's points from its centre [m]
+    rays: Rays  # to the mean
+
+
+def new_candidates() -> Candidates:
+    """Fresh scratch memory."""
+    n = 512 * 64
+    return Candidates(
+        corner_of=np.empty(512, np.int32),
+        corner=np.empty((512, 3)),
+        slot=np.empty(n, np.int32),
+        voxel=np.empty(n, np.int32),
+        place=np.empty((3, n), np.float32),
+        total=np.empty((3, n), np.float32),
+        rays=new_rays(n),
+    )
+
 
 @kernel
-def pixel(x: float, y: float, z: float) -> tuple[int, int, int]:
-    """Face, row and column of a direction; face -1 for the origin itself."""
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if ax >= ay and ax >= az:
-        face, major, a, b = (0 if x > 0.0 else 1), ax, y, z
-    elif ay >= az:
-        face, major, a, b = (2 if y > 0.0 else 3), ay, x, z
-    else:
-        face, major, a, b = (4 if z > 0.0 else 5), az, x, y
-    if not major > 0.0:
-        return -1, 0, 0
-    scale = 0.5 * PIXELS / major
-    row = min(int(b * scale + 0.5 * PIXELS), PIXELS - 1)
-    column = min(int(a * scale + 0.5 * PIXELS), PIXELS - 1)
-    return face, row, column
-
-
-@kernel
-def fill_cube(points: F32, origin: F64, cube: F32) -> None:
-    """Smallest range of the points (n, 3) in each pixel of ``cube`` (6, PIXELS, PIXELS)."""
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-        face, row, column = pixel(x, y, z)
-        if face >= 0:
-            r = np.float32(math.sqrt(x * x + y * y + z * z))
-            if r < cube[face, row, column]:
-                cube[face, row, column] = r
-
-
-@kernel
-def carve(
-    store: Store,
-    cube: F32,
-    T_world_lidar: F64,
-    origin: F64,
-    block_m: float,
-    reach_m: float,
-    margin_m: float,
-    slope: float,
-    stamp: int,
-) -> int:
+def carve(store: Store, view: View, rules: CarveRules, stamp: int, w: Candidates) -> int:
     """Judge the cells of the blocks around the sensor, every second block at a time.
 
     A cell whose points lie at range r was looked through when the range seen there exceeds r + margin + slope r;
     the margin is a voxel, the slope the error of a range image's pixel at grazing surfaces. Returns how many
     cells lost their evidence.
     """
-    R, t = T_world_lidar[:3, :3], T_world_lidar[:3, 3]
-    ox = R[0, 0] * origin[0] + R[0, 1] * origin[1] + R[0, 2] * origin[2] + t[0]
-    oy = R[1, 0] * origin[0] + R[1, 1] * origin[1] + R[1, 2] * origin[2] + t[1]
-    oz = R[2, 0] * origin[0] + R[2, 1] * origin[1] + R[2, 2] * origin[2] + t[2]
+    block_m, reach_m, o = rules.block_m, rules.reach_m, view.centre
     gone = 0
-    for bx in range(math.floor((ox - reach_m) / block_m), math.floor((ox + reach_m) / block_m) + 1):
-        for by in range(math.floor((oy - reach_m) / block_m), math.floor((oy + reach_m) / block_m) + 1):
-            for bz in range(math.floor((oz - reach_m) / block_m), math.floor((oz + reach_m) / block_m) + 1):
+    for bx in range(math.floor((o[0] - reach_m) / block_m), math.floor((o[0] + reach_m) / block_m) + 1):
+        for by in range(math.floor((o[1] - reach_m) / block_m), math.floor((o[1] + reach_m) / block_m) + 1):
+            for bz in range(
+                math.floor((o[2] - reach_m) / block_m), math.floor((o[2] + reach_m) / block_m) + 1
+            ):
                 if (bx + by + bz + stamp // EVERY) & 1:
                     continue
-                key = bs.block_key(bx, by, bz)
-                at = bs.find_slot(store.hash_key, key)
-                if store.hash_key[at] == key:
-                    gone += _carve_block(
-                        store,
-                        store.hash_slot[at],
-                        cube,
-                        R,
-                        ox,
-                        oy,
-                        oz,
-                        block_m / 32.0,
-                        margin_m,
-                        slope,
-                        stamp,
-                    )
+                block = bs.find_block(store, bx, by, bz)
+                if block >= 0:
+                    voxels = _list_voxels(store, block, view, rules, w)
+                    n = _list_cells(store, voxels, block_m / 32.0, w)
+                    _measure(store.evidence, n, view.R_lidar_world, w)
+                    gone += _judge(store, n, view.range_m, rules, stamp, w)
     store.counter[CARVED_CELLS] += gone
     return gone
 
 
 @kernel
-def _carve_block(
-    store: Store,
-    block: int,
-    cube: F32,
-    R: F64,
-    ox: float,
-    oy: float,
-    oz: float,
-    cell_m: float,
-    margin_m: float,
-    slope: float,
-    stamp: int,
-) -> int:
-    gone = 0
+def _list_voxels(store: Store, block: int, view: View, rules: CarveRules, w: Candidates) -> int:
+    """Voxels of a block that the scan can say something about, and where their corners lie."""
+    voxel_m, o, n = rules.block_m / bs.VOXELS_PER_BLOCK, view.centre, 0
+    half = 0.5 * voxel_m
     for inner in range(512):
         v = store.block_voxel[block, inner]
         if v < 0:
             continue
-        gone_here = 0
-        for c in range(64):
-            s = store.voxel_cell[v, c]
-            if s < 0 or store.evidence[s, COUNT] == 0.0:
-                continue
-            e = store.evidence[s]
-            # the mean of the cell's points: a vertex may not have been made of them yet
-            k = 1.0 / e[COUNT]
-            dx = (4 * store.voxel[v, IX] + (c >> 4) + 0.5) * cell_m + k * e[SUM] - ox
-            dy = (4 * store.voxel[v, IY] + ((c >> 2) & 3) + 0.5) * cell_m + k * e[SUM + 1] - oy
-            dz = (4 * store.voxel[v, IZ] + (c & 3) + 0.5) * cell_m + k * e[SUM + 2] - oz
-            face, row, column = pixel(
-                R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz,
-                R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz,
-                R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz,
-            )
-            if face < 0:
-                continue
-            seen = cube[face, row, column]
-            if seen >= FAR:
-                continue
-            r = math.sqrt(dx * dx + dy * dy + dz * dz)
-            if seen > r + margin_m + slope * r:
-                e[THROUGH] += 1.0
-                if is_seen_through(e):
-                    gone_here += store.state[s] == ALIVE
-                    store.state[s] = CARVED
-                    e[HITS] = 0.0
-                    for k in range(COUNT, THROUGH):
-                        e[k] = 0.0
-                    gone += 1
-            elif seen > r - margin_m:
-                e[CONFIRMED] += 1.0
-        if gone_here > 0:
-            _remesh_around(store, v, stamp)
+        x = store.voxel[v, IX] * voxel_m - o[0]
+        y = store.voxel[v, IY] * voxel_m - o[1]
+        z = store.voxel[v, IZ] * voxel_m - o[2]
+        if not _is_beyond(x + half, y + half, z + half, half, rules.margin_m, view):
+            w.corner_of[n] = v
+            w.corner[n, 0], w.corner[n, 1], w.corner[n, 2] = x, y, z
+            n += 1
+    return n
+
+
+@kernel
+def _list_cells(store: Store, voxels: int, cell_m: float, w: Candidates) -> int:
+    """Cells of the listed voxels."""
+    n = 0
+    for i in range(voxels):
+        v = w.corner_of[i]
+        mask = store.voxel_mask[v]
+        while mask != 0:
+            c = bs.lowest_bit(mask)
+            mask &= mask - np.uint64(1)
+            w.slot[n] = store.voxel_cell[v, c]
+            w.voxel[n] = v
+            w.place[0, n] = w.corner[i, 0] + ((c >> 4) + 0.5) * cell_m
+            w.place[1, n] = w.corner[i, 1] + (((c >> 2) & 3) + 0.5) * cell_m
+            w.place[2, n] = w.corner[i, 2] + ((c & 3) + 0.5) * cell_m
+            n += 1
+    return n
+
+
+@kernel
+def _is_beyond(x: float, y: float, z: float, half: float, margin_m: float, view: View) -> bool:
+    """Whether a voxel around x, y, z certainly lies behind all that was seen near it, or nothing was."""
+    r = math.sqrt(x * x + y * y + z * z)
+    radius = 1.75 * half  # a little more than the voxel's corners: its points were rounded
+    if radius > r * SPREAD:
+        return False
+    R = view.R_lidar_world
+    face, row, column = pixel(
+        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+    )
+    farthest: float = view.farthest_m[face, row // TILE, column // TILE]
+    return farthest <= max(r - radius - margin_m, 0.0)
+
+
+@kernel
+def _measure(evidence: F32, n: int, R: F64, w: Candidates) -> None:
+    """Range and pixel of the mean of each cell's points: a vertex may not have been made of them yet."""
+    for i in range(n):
+        e = evidence[w.slot[i]]
+        w.rays.range_m[i] = e[COUNT]
+        for k in range(3):
+            w.total[k, i] = e[SUM + k]
+    for k in range(3):
+        _add_means(w.rays.range_m[:n], w.total[k], w.place[k])
+    for k in range(3):
+        _turn(w.place, R[k], w.rays.way[k, :n])
+    look_up(w.rays, n)
+
+
+@kernel
+def _add_means(count: F32, total: F32, place: F32) -> None:
+    for i in range(count.shape[0]):
+        place[i] += total[i] / count[i]  # a cell without evidence gives NaN, which has no pixel
+
+
+@kernel
+def _turn(place: F32, r: F64, out: F32) -> None:
+    a, b, c = np.float32(r[0]), np.float32(r[1]), np.float32(r[2])
+    for i in range(out.shape[0]):
+        out[i] = a * place[0, i] + b * place[1, i] + c * place[2, i]
+
+
+@kernel
+def _judge(store: Store, n: int, range_m: F32, rules: CarveRules, stamp: int, w: Candidates) -> int:
+    """Count the looks through each cell and at it; carve what they are too many for."""
+    gone, last = 0, -1
+    for i in range(n):
+        at = w.rays.pixel[i]
+        if at < 0:
+            continue
+        seen, r = range_m[at // PIXELS, at % PIXELS], w.rays.range_m[i]
+        if seen <= r - rules.margin_m or seen >= FAR:
+            continue
+        s = w.slot[i]
+        e = store.evidence[s]
+        if seen <= r + rules.margin_m + rules.slope * r:
+            e[CONFIRMED] += 1.0
+            continue
+        e[THROUGH] += 1.0
+        if is_seen_through(e):
+            if store.state[s] == ALIVE and w.voxel[i] != last:
+                last = w.voxel[i]
+                _remesh_around(store, last, stamp)
+            store.state[s] = CARVED
+            e[HITS] = 0.0
+            for k in range(COUNT, THROUGH):
+                e[k] = 0.0
+            gone += 1
     return gone
 
 
