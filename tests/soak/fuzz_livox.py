@@ -97,14 +97,14 @@ def data2(rng: np.random.Generator) -> list[bytes]:
 
 
 def parse_each(parse: Callable[[bytes], object]) -> Callable[[list[bytes]], float]:
-    """Longest time a single input took."""
+    """Longest CPU time a single input took."""
 
     def run(batch: list[bytes]) -> float:
         slowest = 0.0
         for data in batch:
-            began = time.perf_counter()
+            began = time.thread_time()
             parse(data)
-            slowest = max(slowest, time.perf_counter() - began)
+            slowest = max(slowest, time.thread_time() - began)
         return slowest
 
     return run
@@ -120,9 +120,9 @@ def decode_batches(decoder: LivoxDecoder) -> Callable[[list[bytes]], float]:
             decoder.packets.field["data"][row, : len(data)] = np.frombuffer(data, np.uint8)
             decoder.packets.field["size"][row], decoder.packets.field["rx_ns"][row] = len(data), first + k
         decoder.packets.publish(len(batch))
-        began = time.perf_counter()
+        began = time.thread_time()
         decoder.decode(first, len(batch))
-        taken = time.perf_counter() - began
+        taken = time.thread_time() - began
         c = decoder.counters()
         refused = sum(v for k, v in c.items() if k.startswith("bad_") or k.endswith("_duplicates"))
         assert refused + c["points_packets"] + c["imu_packets"] == decoder.packets.published
