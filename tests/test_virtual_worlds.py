@@ -6,8 +6,8 @@ import functools
 
 import numpy as np
 import pytest
+from artemis_drivers.virtual import corridor, courtyard, hall, route, street
 from artemis_drivers.virtual import movers as moving_things
-from artemis_drivers.virtual import route
 from artemis_drivers.virtual.catalogue import worlds
 from artemis_drivers.virtual.mesh_builder import CLASS_NAMES, F64, MeshBuilder, WorldMesh
 from artemis_drivers.virtual.raycast import build_bvh, cast
@@ -37,12 +37,12 @@ def build(name: str, seed: int, length: float) -> World:
     return worlds()[name](seed, length, atlas(seed if seed > 10 else 1))  # type: ignore[call-arg]
 
 
-@functools.lru_cache(maxsize=20)
+@functools.lru_cache(maxsize=40)
 def world(name: str, seed: int) -> World:
     return build(name, seed, 80.0)
 
 
-@functools.lru_cache(maxsize=20)
+@functools.lru_cache(maxsize=40)
 def mesh(name: str, seed: int) -> WorldMesh:
     return world(name, seed).mesh()
 
@@ -180,6 +180,11 @@ def test_motion_along_goes_there_and_back_or_round() -> None:
     heading = there.angles(np.array([5.0, 15.0]))[:, 0]
     assert np.cos(heading[0]) > 0.99
     assert np.cos(there.angles(np.array([15.0]))[0, 0]) < -0.99
+    once_only = route.motion_once(np.array([[0.0, 0, 0], [50.0, 0, 0]]), 5.0, 60.0, 20.0)
+    np.testing.assert_allclose(once_only.pose([0.0, 10.0, 25.0, 59.0])[:, 0, 3], [0, 0, 25, 50], atol=0.1)
+    speed = once_only.velocity(np.linspace(0, 60, 601))[:, 0]
+    assert speed.min() > -0.05 and 4.5 < speed.max() < 5.1
+    assert np.abs(np.diff(speed)).max() / 0.1 < 3.0  # m/s2
     square = route.rounded_loop(np.array([[0.0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]]), 1.0)
     np.testing.assert_allclose(square[0], square[-1])
     once = np.linalg.norm(np.diff(square, axis=0), axis=1).sum()
@@ -239,8 +244,7 @@ def test_behind_a_pane_lies_a_room() -> None:
 
 def samples(name: str, seed: int, count: int, by_area: bool) -> tuple[F64, I64]:
     """Colours 0..1 (n, 3) and labels (n,) of points spread over a world's surfaces, as its textures give them."""
-    built = build(name, seed, 80.0)
-    m, arrays = built.mesh(), built.atlas.arrays
+    m, arrays = mesh(name, seed), world(name, seed).atlas.arrays
     rng = np.random.default_rng(seed)
     area, _ = m.areas_and_normals()
     share = area if by_area else area / np.bincount(m.class_id, area, len(CLASS_NAMES))[m.class_id]
@@ -269,14 +273,14 @@ def test_a_pixels_colour_alone_does_not_tell_its_class(by_area: bool) -> None:
     outdoors_and_in, many, classes = ("street", "courtyard", "hall"), 12_000, len(CLASS_NAMES)
     count = np.full((classes, 8**3), 0.02)
     for name in outdoors_and_in:
-        for seed in (11, 12, 13):
+        for seed in (11, 12):
             colour, label = samples(name, seed, many, by_area)
             np.add.at(count, (label, colour_cells(colour)), 1.0)
     if not by_area:
         count /= count.sum(axis=1, keepdims=True)
     confusion = np.zeros((classes, classes))
     for name in outdoors_and_in:
-        colour, label = samples(name, 21, many, by_area)
+        colour, label = samples(name, 13, many, by_area)
         np.add.at(confusion, (label, count[1:, colour_cells(colour)].argmax(axis=0) + 1), 1.0)
     hit, seen = np.diag(confusion), confusion.sum(axis=1) > 0
     union = confusion.sum(axis=0) + confusion.sum(axis=1) - hit
@@ -284,3 +288,22 @@ def test_a_pixels_colour_alone_does_not_tell_its_class(by_area: bool) -> None:
     assert seen.sum() >= 18
     assert 0.02 < miou < 0.35, f"mIoU {miou:.3f}"
     print(f"mIoU {miou:.3f}")
+
+
+def test_no_world_uses_a_material_that_it_leaves_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = atlas(1)
+
+    def lacking(seed: int, leave_out: tuple[str, ...] = ()) -> TextureAtlas:
+        assert leave_out
+        return TextureAtlas(
+            whole.arrays, {n: k for n, k in whole.index.items() if not n.startswith(leave_out)}
+        )
+
+    for module in (corridor, courtyard, hall, street):
+        monkeypatch.setattr(module, "build_atlas", lacking)
+    for name, make in worlds().items():
+        for seed in range(40, 44):
+            assert len(make(seed, 45.0).build_block(0).triangles) > 50, name
+    some = build_atlas(5, ("plaster", "window", "brick", "poster", "shop", "goods", "books"))
+    assert "plaster_a" not in some.index and "asphalt" in some.index
+    assert some.arrays.glass[some.index["pane"]]

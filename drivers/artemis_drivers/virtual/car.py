@@ -134,19 +134,19 @@ def _add_wheels(builder: MeshBuilder, kind: _Kind, T: F64) -> None:
         for sign in (-1.0, 1.0):
             T_wheel = T @ pose(x, sign * (side - 0.11), radius, roll=np.pi / 2)
             builder.add(
-                cylinder(radius + 0.055, -0.10, 0.10, 20),
+                cylinder(radius + 0.055, -0.10, 0.10, 14),
                 "rubber",
                 (0.08, 0.08, 0.08),
                 T_wheel @ pose(z=-sign * 0.012),
             )
             builder.add(
-                cylinder(radius, -0.11, 0.11, 20),
+                cylinder(radius, -0.11, 0.11, 18),
                 "rubber",
                 (0.16, 0.16, 0.17),
                 T_wheel @ pose(z=-sign * 0.015),
             )
             builder.add(
-                cylinder(radius * 0.62, -0.11, 0.11, 14),
+                cylinder(radius * 0.62, -0.11, 0.11, 12),
                 "metal",
                 (0.75, 0.75, 0.78),
                 T_wheel @ pose(z=-sign * 0.028),

@@ -10,10 +10,21 @@ from artemis_drivers.virtual.building import fitted_panel
 from artemis_drivers.virtual.interior import wall_paint
 from artemis_drivers.virtual.mesh_builder import F64, Colour, MeshBuilder, Shape, WorldMesh
 from artemis_drivers.virtual.shapes import box, panel, pose, solid
-from artemis_drivers.virtual.textures import PRINTS, TextureAtlas, build_atlas
+from artemis_drivers.virtual.textures import HOUSES, INDOORS, PRINTS, ROADS, TextureAtlas, build_atlas
 from artemis_drivers.virtual.world import World, random_sun
 
 EYE_M = 1.45
+_THINGS = (
+    "wood",
+    "door",
+    "metal",
+    "cloth",
+    "bark",
+    "car_paint",
+    "stripes",
+    "check",
+    "cardboard",
+)  # not drawn here
 BLOCK_M = 40.0
 FACADE_M = 2.0  # distance of the facade from the walker's line
 _MARGIN_M = 6.0  # the path keeps this far from the ends
@@ -55,7 +66,7 @@ def build_corridor(seed: int, length: float = 100.0, atlas: TextureAtlas | None 
     wide, high = float(rng.uniform(1.9, 2.6)), float(rng.uniform(2.4, 2.9))
     floor, sides, top = wall_paint(rng), wall_paint(rng), wall_paint(rng)
     floor_of = str(rng.choice(["lino", "terrazzo"]))
-    atlas = build_atlas(seed) if atlas is None else atlas
+    atlas = build_atlas(seed, (*ROADS, *HOUSES, *_THINGS)) if atlas is None else atlas
 
     def block(k: int, blocks: int) -> WorldMesh:
         builder = MeshBuilder(atlas.index, k * _INSTANCES_PER_BLOCK)
@@ -87,7 +98,7 @@ def build_facade(seed: int, length: float = 100.0, atlas: TextureAtlas | None = 
     azimuth, elevation = rng.uniform(-2.3, -0.8), np.radians(rng.uniform(25, 50))
     across = np.cos(elevation)
     sun = np.array([np.cos(azimuth) * across, np.sin(azimuth) * across, np.sin(elevation)])
-    atlas = build_atlas(seed) if atlas is None else atlas
+    atlas = build_atlas(seed, (*INDOORS, *HOUSES, *_THINGS)) if atlas is None else atlas
 
     def block(k: int, blocks: int) -> WorldMesh:
         del blocks

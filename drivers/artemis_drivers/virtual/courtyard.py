@@ -23,17 +23,19 @@ from artemis_drivers.virtual.interior import (
     add_steps,
     add_table,
     any_colour,
+    wall_paint,
 )
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder, WorldMesh
 from artemis_drivers.virtual.movers import add_walker
 from artemis_drivers.virtual.person import add_backpack, add_person, add_sitting_person, add_statue
 from artemis_drivers.virtual.route import laps, rounded_loop
 from artemis_drivers.virtual.shapes import box, pose, solid
-from artemis_drivers.virtual.textures import TextureAtlas, build_atlas
+from artemis_drivers.virtual.textures import INDOORS, ROADS, TextureAtlas, build_atlas
 from artemis_drivers.virtual.tree import add_hedge, add_tree
 from artemis_drivers.virtual.world import Mover, World, random_sun
 
 Rng = np.random.Generator
+_NOT_HERE = (*INDOORS, *ROADS)  # materials that are not drawn
 EYE_M = 1.45
 _RING = (3.0, 6.6)  # metres from the walls that the paved ring covers
 _WALK, _OTHERS = 5.3, 3.9  # where the walker goes, and where the others go
@@ -68,7 +70,7 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
     rng = np.random.default_rng([seed, 1])
     yard = _Yard(float(rng.uniform(31, 38)), float(rng.uniform(23, 28)))
     sun = random_sun(rng)
-    atlas = build_atlas(seed) if atlas is None else atlas
+    atlas = build_atlas(seed, _NOT_HERE) if atlas is None else atlas
     loop = yard.ring(_WALK, 2.5)
     if rng.random() < 0.5:
         loop = loop[::-1]
@@ -121,7 +123,7 @@ def _add_ground(builder: MeshBuilder, yard: _Yard, rng: Rng) -> None:
     ]
     lines_y = [-0.5, outer, inner, yard.wide - inner, yard.wide - outer, yard.wide + 0.5]
     materials = rng.permutation(["cobbles", "paving", "gravel"])
-    tints = [any_colour(rng, 0.7, 1.0) for _ in range(3)]
+    tints = [wall_paint(rng) for _ in range(3)]
     ways = (str(materials[0]), str(materials[1]), str(rng.choice(["grass", "grass", "gravel"])))
     builder.begin("ground")
     for i in range(5):
@@ -152,7 +154,7 @@ def _add_terrace(builder: MeshBuilder, yard: _Yard, rng: Rng) -> None:
     high = _STEPS * RISER_M
     builder.begin("ground")
     top = box((-0.3, 1.2, -0.3), (_TERRACE, yard.wide - 1.2, high))
-    builder.add(top, str(rng.choice(["paving", "terrazzo"])), any_colour(rng, 0.7, 1.0))
+    builder.add(top, str(rng.choice(["paving", "terrazzo"])), wall_paint(rng))
     wide = yard.wide * rng.uniform(0.25, 0.4)
     y0 = rng.uniform(2.5, yard.wide - 2.5 - wide)
     stair = pose(yard.west, y0 + wide, 0, np.pi)

@@ -6,7 +6,7 @@ import numpy as np
 
 from artemis_drivers.virtual.mesh_builder import F64, Colour, MeshBuilder, Shape
 from artemis_drivers.virtual.person import add_figure, random_outfit, riding
-from artemis_drivers.virtual.shapes import box, cylinder, limb, loft, merged, pose
+from artemis_drivers.virtual.shapes import bar, box, cylinder, limb, loft, merged, pose
 
 Rng = np.random.Generator
 _WHEEL_M = 0.33  # radius
@@ -29,8 +29,7 @@ def _ring(radius: float, thick: float, around: int = 24, sides: int = 5) -> Shap
 
 def _wheel() -> Shape:
     spokes = [
-        limb((0, 0, 0), (0.31 * np.cos(a), 0, 0.31 * np.sin(a)), 0.004, 0.004, 4)
-        for a in np.arange(10) * 2 * np.pi / 10
+        bar((0, 0, 0), (0.31 * np.cos(a), 0, 0.31 * np.sin(a)), 0.007) for a in np.arange(10) * 2 * np.pi / 10
     ]
     hub = cylinder(0.03, -0.045, 0.045, 8).moved(pose(roll=np.pi / 2))
     return merged([hub, *spokes])

@@ -15,6 +15,7 @@ from artemis_drivers.virtual import furniture
 from artemis_drivers.virtual.building import fitted_panel
 from artemis_drivers.virtual.interior import (
     RISER_M,
+    SHELF_DEEP_M,
     TREAD_M,
     Opening,
     add_chair,
@@ -33,10 +34,11 @@ from artemis_drivers.virtual.movers import add_walker
 from artemis_drivers.virtual.person import add_backpack, add_person, add_sitting_person, add_statue
 from artemis_drivers.virtual.route import laps, rounded_loop
 from artemis_drivers.virtual.shapes import box, pose
-from artemis_drivers.virtual.textures import TextureAtlas, build_atlas
+from artemis_drivers.virtual.textures import HOUSES, ROADS, TextureAtlas, build_atlas
 from artemis_drivers.virtual.world import Mover, World, random_sun
 
 Rng = np.random.Generator
+_NOT_HERE = (*ROADS, *HOUSES)  # materials that are not drawn
 EYE_M = 1.45
 _WALL_M = 0.2  # thickness of walls
 _STAIR_WIDE = 2.4
@@ -100,7 +102,7 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
     loop = _loop(plan)
     if rng.random() < 0.5:
         loop = loop[::-1]
-    atlas = build_atlas(seed) if atlas is None else atlas
+    atlas = build_atlas(seed, _NOT_HERE) if atlas is None else atlas
     return World(
         name="hall",
         seed=seed,
@@ -291,15 +293,15 @@ def _add_shelves(builder: MeshBuilder, plan: _Plan, rng: Rng) -> None:
     x = 7.0
     while x < plan.long - 9.0:
         bays = int(rng.integers(2, 4))
-        add_shelf(builder, rng, pose(x, middle + 0.002), bays, kind)  # back to back
-        add_shelf(builder, rng, pose(x + bays, middle, 0, np.pi), bays, kind)
+        add_shelf(builder, rng, pose(x, middle - SHELF_DEEP_M), bays, kind)  # back to back
+        add_shelf(builder, rng, pose(x + bays, middle + SHELF_DEEP_M + 0.002, 0, np.pi), bays, kind)
         x += bays + rng.uniform(0.8, 1.6)
     for x in (rng.uniform(5.0, 8.0), rng.uniform(14.0, 17.0)):
-        add_shelf(builder, rng, pose(x + 3, 0.36, 0, np.pi), 3, kind)
+        add_shelf(builder, rng, pose(x + 3, SHELF_DEEP_M + 0.01, 0, np.pi), 3, kind)
     x0, x1 = plan.gallery_x
     for x in np.arange(x0 + 0.5, x1 - 3.2, 4.0):
         if rng.random() < 0.7:
-            add_shelf(builder, rng, pose(x, plan.wide - 0.36), 3, kind)
+            add_shelf(builder, rng, pose(x, plan.wide - SHELF_DEEP_M - 0.01), 3, kind)
 
 
 def _add_clutter(builder: MeshBuilder, plan: _Plan, rng: Rng) -> None:

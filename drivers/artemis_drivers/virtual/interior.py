@@ -9,10 +9,11 @@ import numpy as np
 
 from artemis_drivers.virtual.building import fitted_panel
 from artemis_drivers.virtual.mesh_builder import F64, Colour, MeshBuilder, Shape
-from artemis_drivers.virtual.shapes import box, cylinder, limb, merged, pose, solid
+from artemis_drivers.virtual.shapes import bar, box, cylinder, limb, merged, pose, solid
 from artemis_drivers.virtual.textures import PRINTS
 
 Rng = np.random.Generator
+SHELF_DEEP_M = 0.34
 RISER_M, TREAD_M = 0.17, 0.30  # of a stair
 _RAIL_M = 1.0  # height of railings
 _BAY_M = 1.0  # width of a shelf's bay
@@ -104,7 +105,7 @@ def add_chair(builder: MeshBuilder, rng: Rng, T: F64) -> None:
 def add_shelf(builder: MeshBuilder, rng: Rng, T: F64, bays: int, kind: str = "books") -> None:
     """Open shelf along x with its front towards -y: ``bays`` of 1 m, full of ``kind`` (books or goods)."""
     builder.begin("shelf")
-    deep, high, boards = 0.34, rng.uniform(1.7, 2.3), int(rng.integers(4, 6))
+    deep, high, boards = SHELF_DEEP_M, rng.uniform(1.7, 2.3), int(rng.integers(4, 6))
     colour = any_colour(rng, 0.25, 1.0)
     material = str(rng.choice(["wood", "bare"]))
     frame = [box((k * _BAY_M - 0.015, 0, -0.02), (k * _BAY_M + 0.015, deep, high)) for k in range(bays + 1)]
@@ -166,7 +167,7 @@ def add_railing(builder: MeshBuilder, colour: Colour, foot: F64) -> None:
         bars.append(limb(a + 0.12 * up, b + 0.12 * up, 0.012, 0.012, 6))
         count = max(int(np.linalg.norm((b - a)[:2]) / 0.16), 1)
         bars += [
-            limb(p + 0.1 * up, p + 0.99 * up, 0.009, 0.009, 5)
+            bar(p + 0.1 * up, p + 0.99 * up, 0.016)
             for p in a + (b - a) * ((np.arange(count) + 0.5) / count)[:, None]
         ]
     bars += [limb(p - 0.02 * up, p + 0.99 * up, 0.02, 0.02, 8) for p in foot]

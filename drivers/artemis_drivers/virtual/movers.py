@@ -10,7 +10,7 @@ from artemis_drivers.virtual.cyclist import add_bicycle
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder, WorldMesh
 from artemis_drivers.virtual.motion import Motion
 from artemis_drivers.virtual.person import HIP_M, add_figure, leg_of, random_outfit, striding
-from artemis_drivers.virtual.route import motion_along
+from artemis_drivers.virtual.route import motion_along, motion_once
 from artemis_drivers.virtual.textures import TextureAtlas
 from artemis_drivers.virtual.world import Mover
 
@@ -19,29 +19,26 @@ _STEP_S = 0.1  # spacing of a walking leg's samples: a tenth of a stride
 _SWING = 0.42  # radians that a leg swings to either side
 
 
-def add_traffic(
+def vehicle(
     atlas: TextureAtlas,
     rng: Rng,
     instance: int,
     line: F64,
     duration_s: float,
+    leave_s: float,
     add: Callable[[MeshBuilder, Rng, F64], None],
-    speed: float,
-) -> list[Mover]:
-    """A rigid thing that ``add`` builds, driving along ``line`` there and back."""
+) -> Mover:
+    """What ``add`` builds (its instances count from ``instance``), driving along ``line`` once."""
     builder = MeshBuilder(atlas.index, instance)
     add(builder, rng, np.eye(4))
-    start = rng.uniform(0, 0.5) * float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-    return [Mover(builder.build(), motion_along(line, speed, duration_s, start))]
+    slow = add is add_rider
+    speed = rng.uniform(3.0, 4.5) if slow else rng.uniform(4.5, 8.0)
+    return Mover(builder.build(), motion_once(line, speed, duration_s, leave_s))
 
 
-def add_rider(atlas: TextureAtlas, rng: Rng, instance: int, line: F64, duration_s: float) -> list[Mover]:
-    """A cyclist: bicycle ``instance`` and its rider ``instance`` + 1 in one body."""
-
-    def add(builder: MeshBuilder, rng: Rng, T: F64) -> None:
-        add_bicycle(builder, rng, T, ridden=True)
-
-    return add_traffic(atlas, rng, instance, line, duration_s, add, rng.uniform(3.0, 4.5))
+def add_rider(builder: MeshBuilder, rng: Rng, T: F64) -> None:
+    """A bicycle and its rider."""
+    add_bicycle(builder, rng, T, ridden=True)
 
 
 def add_walker(

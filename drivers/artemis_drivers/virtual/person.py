@@ -13,7 +13,7 @@ from artemis_drivers.virtual.shapes import box, cylinder, ellipsoid, limb, loft,
 Rng = np.random.Generator
 HIP_M, SHOULDER_M = 0.90, 1.42  # heights on a standing figure of 1.75 m
 _TALL_M = 1.75
-_SIDES = 8
+_SIDES = 7
 _SKINS: tuple[Colour, ...] = ((1.0, 1.0, 1.0), (0.86, 0.78, 0.72), (0.62, 0.52, 0.45), (0.42, 0.34, 0.3))
 _CLOTHS = ("cloth", "stripes", "check", "denim")
 

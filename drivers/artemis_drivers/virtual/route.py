@@ -10,6 +10,7 @@ from artemis_drivers.virtual.motion import Motion
 
 SPACING_M = 0.25
 _FINE_M = 0.05
+_DRIVE_STEP_S, _BRAKING_S = 0.2, 1.5
 
 
 def resampled(points: F64, spacing_m: float) -> F64:
@@ -52,5 +53,21 @@ def motion_along(
     heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
     heading = np.interp(t, t[moving], heading[moving])
     heading = gaussian_filter1d(heading, 0.5 / step_s, mode="nearest")
+    angles = np.column_stack([heading, np.zeros_like(t), np.zeros_like(t)])
+    return Motion.through(t, position, angles)
+
+
+def motion_once(line: F64, speed: float, duration_s: float, leave_s: float) -> Motion:
+    """Motion from one end of ``line`` (n, 3) to the other, standing until ``leave_s`` and at the end."""
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    t = np.arange(0.0, max(duration_s, 2.0) + _DRIVE_STEP_S, _DRIVE_STEP_S)
+    s = np.clip(speed * (t - leave_s), 0.0, arc[-1])
+    s = gaussian_filter1d(s, _BRAKING_S / _DRIVE_STEP_S, mode="nearest")
+    position = np.column_stack([np.interp(s, arc, line[:, k]) for k in range(3)])
+    before, after = (
+        np.column_stack([np.interp(s + d, arc, line[:, k]) for k in (0, 1)]) for d in (-1.0, 1.0)
+    )
+    heading = np.unwrap(np.arctan2(*(after - before).T[::-1]))
+    position = gaussian_filter1d(position, 2.0, axis=0, mode="nearest")
     angles = np.column_stack([heading, np.zeros_like(t), np.zeros_like(t)])
     return Motion.through(t, position, angles)

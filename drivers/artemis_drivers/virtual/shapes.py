@@ -188,7 +188,9 @@ def disc_panel(radius: float, thickness: float, sides: int = 24) -> Shape:
 
 
 def leaf_cards(centres: F64, normals: F64, spin: F64, length: float, width: float) -> Shape:
-    """Pointed leaves, thin closed double pyramids: ``centres``, ``normals`` (n, 3), ``spin`` (n,) radians."""
+    """Pointed leaves, folded a little: flat closed tetrahedra. ``centres``, ``normals`` (n, 3), ``spin`` (n,)
+    radians.
+    """
     n = len(centres)
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     a = np.cross(helper, normals)
@@ -196,16 +198,16 @@ def leaf_cards(centres: F64, normals: F64, spin: F64, length: float, width: floa
     b = np.cross(normals, a)
     along = np.cos(spin)[:, None] * a + np.sin(spin)[:, None] * b
     across = np.cross(normals, along)
-    thick = 0.004  # metres: thin enough to look flat, thick enough for float32
-    rim = np.stack([along * length, across * width, -along * length, -across * width], axis=1) / 2
-    tips = np.stack([normals * thick, -normals * thick], axis=1) / 2
-    vertices = (centres[:, None, :] + np.concatenate([rim, tips], axis=1)).reshape(-1, 3)
-    pattern = np.array(
-        [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4), (1, 0, 5), (2, 1, 5), (3, 2, 5), (0, 3, 5)], np.int32
-    )
-    triangles = (np.arange(n, dtype=np.int32)[:, None, None] * 6 + pattern).reshape(-1, 3)
-    local = np.array(
-        [(length / 2, 0), (0, width / 2), (-length / 2, 0), (0, -width / 2), (0, 0), (0, 0)], np.float64
-    )
-    uv = np.tile(local[pattern], (n, 1, 1)) + np.repeat(spin, 8)[:, None, None]
+    fold = normals * 0.006  # metres: thin enough to look flat, thick enough for float32
+    rim = [along * length + fold, across * width - fold, fold - along * length, -across * width - fold]
+    vertices = (centres[:, None, :] + np.stack(rim, axis=1) / 2).reshape(-1, 3)
+    pattern = np.array([(0, 1, 2), (0, 2, 3), (1, 0, 3), (1, 3, 2)], np.int32)
+    triangles = (np.arange(n, dtype=np.int32)[:, None, None] * 4 + pattern).reshape(-1, 3)
+    local = np.array([(length / 2, 0), (0, width / 2), (-length / 2, 0), (0, -width / 2)], np.float64)
+    uv = np.tile(local[pattern], (n, 1, 1)) + np.repeat(spin, len(pattern))[:, None, None]
     return Shape(vertices, triangles, uv, np.zeros(len(triangles), np.int32))
+
+
+def bar(a: Numbers, b: Numbers, thickness: float) -> Shape:
+    """Square bar between two points."""
+    return tube(np.stack([np.asarray(a, np.float64), np.asarray(b, np.float64)]), (thickness / 1.414,) * 2, 4)

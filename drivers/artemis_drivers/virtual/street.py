@@ -17,14 +17,15 @@ from artemis_drivers.virtual.building import add_gate_wall, add_house
 from artemis_drivers.virtual.car import add_car
 from artemis_drivers.virtual.cyclist import add_bicycle
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder, Shape, WorldMesh
-from artemis_drivers.virtual.movers import add_rider, add_traffic, add_walker
+from artemis_drivers.virtual.movers import add_rider, add_walker, vehicle
 from artemis_drivers.virtual.person import add_backpack, add_person, add_sitting_person
 from artemis_drivers.virtual.shapes import pose, solid
-from artemis_drivers.virtual.textures import TextureAtlas, build_atlas
+from artemis_drivers.virtual.textures import INDOORS, TextureAtlas, build_atlas
 from artemis_drivers.virtual.tree import add_hedge, add_tree
 from artemis_drivers.virtual.world import Mover, World, random_sun
 
 Rng = np.random.Generator
+_NOT_HERE = (*INDOORS, "poster_", "terrazzo", "grass", "gravel", "marble")  # materials that are not drawn
 BLOCK_M = 40.0
 STATION_M = 1.0  # spacing of the ground's cross sections
 KERB_M = 0.12  # height of the kerb
@@ -32,7 +33,9 @@ _PARKING_M = 2.1
 EYE_M = 1.45  # height at which the rig is held
 INSTANCES_PER_BLOCK = 4096
 HOUSE_DEPTH_M = 9.0
-SLOW_WALK = 0.8  # m/s: for how long the world must keep moving
+SLOW_WALK, _USUAL_WALK = 0.8, 1.1  # m/s: for how long the world must keep moving, and when cars come by
+_MOST_VEHICLES, _MOST_WALKERS = 6, 6
+_QUEUE_M = 7.0  # from car to car where they wait
 END_MARGIN_M = 8.0  # the path keeps this far from the ends of the street
 
 
@@ -111,7 +114,7 @@ def build(seed: int, length: float = 100.0, atlas: TextureAtlas | None = None) -
             for c in ((1, 1, 1), (0.85, 0.82, 0.78), (0.95, 0.95, 0.93), (0.55, 0.54, 0.53))
         ),
     )
-    atlas = build_atlas(seed) if atlas is None else atlas
+    atlas = build_atlas(seed, _NOT_HERE) if atlas is None else atlas
     return World(
         name="street",
         seed=seed,
@@ -317,7 +320,7 @@ def _movers(layout: _Layout, atlas: TextureAtlas, blocks: int) -> tuple[Mover, .
     """Cars and a cyclist in the left lane, walkers on both pavements."""
     rng = np.random.default_rng([layout.seed, 3])
     instance = blocks * INSTANCES_PER_BLOCK
-    duration = 2.0 * layout.length / SLOW_WALK + 60.0
+    duration = layout.length / SLOW_WALK + 60.0
     movers: list[Mover] = []
 
     def line(y: float, first: float, last: float) -> F64:
@@ -325,17 +328,20 @@ def _movers(layout: _Layout, atlas: TextureAtlas, blocks: int) -> tuple[Mover, .
         return np.column_stack([x, np.full_like(x, y), [layout.ground(a, y) for a in x]])
 
     middle = layout.road - _PARKING_M - 1.25  # of the lane of those who come towards the walker
-    for _ in range(2):
-        instance += 1
-        way = line(middle, layout.length - 3.0, 3.0)
-        movers += add_traffic(atlas, rng, instance, way, duration, add_car, rng.uniform(4.0, 8.0))
-    instance += 2
-    movers += add_rider(atlas, rng, instance, line(middle - 0.4, layout.length - 6.0, 6.0), duration)
-    for k in range(blocks + 1):
-        instance += 1
+    count = int(np.clip(layout.length / 60.0, 3, _MOST_VEHICLES))
+    for k in range(count):
+        # they wait in a queue at the far end and drive one after another through the whole street
+        way = line(middle, layout.length - 5.0 - _QUEUE_M * k, 5.0 + _QUEUE_M * (count - 1 - k))
+        leave = (count - 1 - k + rng.uniform(0.05, 0.6)) / count * layout.length / _USUAL_WALK
+        add = add_rider if k == count - 2 else add_car
+        movers.append(vehicle(atlas, rng, instance + 2 * k, way, duration, leave, add))
+    instance += 2 * count
+    for k in range(min(blocks + 1, _MOST_WALKERS)):
         side = 1.0 if k % 2 else -1.0
-        y = side * (layout.road + 0.55 + rng.uniform(0.75, layout.pavement - 1.9 + 0.8))
-        start = (k + rng.random()) * BLOCK_M
+        y = side * (layout.road + rng.uniform(1.3, layout.pavement - 0.55))
+        start = rng.uniform(0, min(layout.length, 160.0))
         way = line(y, 4.0, layout.length - 4.0)
-        movers += add_walker(atlas, rng, instance, way, duration, start)
+        if k % 4 > 1:
+            way, start = way[::-1], layout.length - start
+        movers += add_walker(atlas, rng, instance + k, way, duration, start)
     return tuple(movers)

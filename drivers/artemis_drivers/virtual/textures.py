@@ -26,6 +26,10 @@ SHOP_SIGNS = 8
 ROAD_SIGNS = 5
 PLATES = 6
 PRINTS = 4  # of books, posters and goods each
+#: Beginnings of the names of materials that are found indoors only, and on roads and houses only.
+INDOORS = ("books_", "goods_", "lino", "bare", "ceiling")
+ROADS = ("asphalt", "lane_paint", "kerbstone", "road_sign_", "plate_")
+HOUSES = ("roof", "window_", "shop_sign_", "shutter", "glass", "cobbles", "gravel")
 #: Material of slow brightness changes, always index 0.
 MACRO = 0
 MACRO_M = 11.3  # its width in metres
@@ -171,12 +175,16 @@ def pack_atlas(materials: Iterable[tuple[str, Material]]) -> TextureAtlas:
     return TextureAtlas(arrays, {name: k for k, name in enumerate(names)})
 
 
-def build_atlas(seed: int) -> TextureAtlas:
-    """All materials drawn from ``seed``; the same seed gives the same bytes."""
+def build_atlas(seed: int, leave_out: tuple[str, ...] = ()) -> TextureAtlas:
+    """Materials drawn from ``seed``; the same seed gives the same bytes.
+
+    Those whose names begin with one of ``leave_out`` are not drawn: a world saves the time for what it lacks.
+    """
 
     def drawn(name: str, recipe: _Recipe) -> Material:
         rng = np.random.default_rng([seed, 7, *name.encode()])
         picture = np.rint(np.clip(recipe.draw(rng), 0, 1) * 255).astype(np.uint8)
         return Material(picture, recipe.metres, recipe.reflectivity, recipe.gloss, recipe.glass)
 
-    return pack_atlas((name, drawn(name, recipe)) for name, recipe in _recipes().items())
+    wanted = {n: r for n, r in _recipes().items() if not n.startswith(leave_out)}
+    return pack_atlas((name, drawn(name, recipe)) for name, recipe in wanted.items())
