@@ -9,7 +9,7 @@ from artemis_drivers.virtual import street
 from artemis_drivers.virtual.camera import CameraSpec, VirtualCamera, distort, undistort
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder
 from artemis_drivers.virtual.motion import Motion
-from artemis_drivers.virtual.scene import Scene, Window, cast_at, prepare
+from artemis_drivers.virtual.scene import Scene, Window, cast_at, local_rays, prepare
 from artemis_drivers.virtual.sensor import (
     REFERENCE,
     AutoExposure,
@@ -24,7 +24,7 @@ from artemis_drivers.virtual.sensor import (
 from artemis_drivers.virtual.shading import Film, sample
 from artemis_drivers.virtual.shapes import box, pose
 from artemis_drivers.virtual.spans import NOTHING, View, draw, new_canvas
-from artemis_drivers.virtual.textures import LEVELS, SIZE, TextureAtlas, build_atlas
+from artemis_drivers.virtual.textures import LEVELS, MACRO, MACRO_M, SIZE, TextureAtlas, build_atlas
 from artemis_drivers.virtual.true_view import truth_images
 from artemis_drivers.virtual.world import Mover, World
 
@@ -157,6 +157,75 @@ def test_textures_are_sampled_between_texels_and_levels(atlas: TextureAtlas) -> 
         got = sample(atlas.arrays.texels, atlas.arrays.start, brick, u, v, lod)
         # a 64th of the step between two texels is the resolution of the position
         np.testing.assert_allclose(got, naive_sample(atlas, brick, u, v, lod), atol=4.0)
+
+
+def naive_light(scene: Scene, T: F64, line: F64, sun: F64, wide: float) -> F64:
+    """Light along one line of sight x, y by the formulas of the shading, with rays for the shadows."""
+    d = np.append(line, 1.0)
+    d = T[:3, :3] @ (d / np.linalg.norm(d))
+    hits = cast_at(scene, T[None, :3, 3], d[None], 0.0)
+    t, s = int(hits.triangle[0]), float(hits.distance_m[0])
+    row, look = scene.surface.rows[t].astype(float), scene.surface.look[t].astype(float)
+    point = T[:3, 3] + s * d
+    (p,), (facing,) = local_rays(scene, hits.triangle, point[None], d[None], 0.0)
+    u, v = row[4:7] @ p + row[7], row[8:11] @ p + row[11]
+    lod = np.log2(s * wide / np.sqrt(max(-row[:3] @ facing, 0.02)))
+    paint = naive_sample(scene.atlas, int(look[3]), u, v, lod + row[12])
+    level = min(max(lod + np.log2(SIZE / MACRO_M), 0), LEVELS - 1)
+    slow = naive_sample(scene.atlas, MACRO, u * row[15] + row[13], v * row[15] + row[14], float(int(level)))[
+        0
+    ]
+    reflectance = (paint * look[:3] / 255 / 255 * slow / 217) ** 2
+    normal = row[:3]
+    for mover in scene.movers:
+        if t >= mover.first:
+            normal = mover.pose(0.0)[0, :3, :3] @ normal
+    start = point + 1e-3 * normal
+    lit = cast_at(scene, start[None], sun[None], 0.0).triangle[0] < 0
+    direct = max(normal @ sun, 0.0) * lit
+    sky = 0.62 + 0.38 * normal[2]
+    return np.asarray(
+        reflectance * (np.array([1.25, 1.15, 0.98]) * direct + np.array([0.42, 0.47, 0.56]) * sky)
+    )
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_shading_agrees_with_its_formulas_and_with_rays_to_the_sun(atlas: TextureAtlas, moving: bool) -> None:
+    """A wall, a floor, and a crate that stands or is carried, whose shadow falls on both."""
+    builder = MeshBuilder(atlas.index)
+    builder.begin("building")
+    builder.add(box((8, -6, 0), (9, 6, 5)), "plaster_a")
+    builder.begin("ground")
+    builder.add(box((-1, -6, -0.5), (8.5, 6, 0)), "concrete")
+    crate = MeshBuilder(atlas.index, 9)
+    crate.begin("other")
+    crate.add(box((-0.5, -0.5, 0), (0.5, 0.5, 1)), "cardboard")
+    here = np.tile([5.0, 0.5, 1.0], (9, 1))
+    still = Motion.through(np.linspace(0, 1, 9), here, np.tile([0.4, 0.0, 0.0], (9, 1)))
+    movers = (Mover(crate.build(), still),)
+    if not moving:
+        builder.begin("other")
+        builder.add(box((-0.5, -0.5, 0), (0.5, 0.5, 1)), "cardboard", T_world_shape=still.pose(0.0)[0])
+        movers = ()
+    scene = prepare(builder.build(), atlas, movers)
+    sun = np.array([-0.5, -0.35, 0.6]) / np.linalg.norm([-0.5, -0.35, 0.6])
+    camera = VirtualCamera(CameraSpec().scaled(96), 0)
+    T = looking(0.0, 0.0, 2.0)
+    light = camera.render(scene, sun, T)
+    rows, columns = (a.ravel() for a in np.mgrid[4:77:4, 4:96:5])
+    wide = 1 / camera.spec.fx
+    sure = camera._film.depth.reshape(77, 96)[rows, columns] < 100
+    expected = np.array(
+        [
+            naive_light(scene, T, camera.lines[i, j, 4].astype(float), sun, wide) if ok else light[i, j]
+            for i, j, ok in zip(rows, columns, sure, strict=True)
+        ]
+    )
+    error = np.abs(light[rows, columns] - expected).max(axis=1)
+    assert sure.mean() > 0.6
+    assert np.mean(error < 0.02) > 0.9  # the rest: pixels at edges and at the borders of shadows
+    dark = (expected[:, 0] < 0.5 * np.median(expected[sure][:, 0])) & sure
+    assert dark.sum() > 3
 
 
 # --- the lens and what is seen
@@ -304,6 +373,55 @@ def test_motion_blur_is_the_mean_over_the_exposure(atlas: TextureAtlas, case: st
 
     # at the silhouette of a mover the filter blurs only what lies inside it
     assert rms(expected) < (0.8 if case == "mover" else 0.35) * rms(sharp)
+
+
+def naive_expose(film: Film, lines: F64, moved: F64, lens: Optics, raw_scale: F64) -> F64:
+    """Numbers without noise: each pixel's path by projecting its point before and after, sampled densely."""
+    height, width = lines.shape[:2]
+    light = film.light.reshape(height, width, 3).astype(float)
+    out = np.zeros((height, width))
+
+    def pixel(p: F64) -> F64:
+        return np.array(distort(p[0] / p[2], p[1] / p[2], lens.k)) * [lens.fx, lens.fy]
+
+    for i, j in np.ndindex(height, width):
+        n = i * width + j
+        far = np.isinf(film.depth[n])
+        p = np.append(lines[i, j], 1.0).astype(float) * (1.0 if far else film.depth[n])
+        D = moved[film.part[n]]
+        h = 1e-4 * (D[:3, :3] @ p + (0 if far else D[:3, 3]))
+        du, dv = (pixel(p + h) - pixel(p - h)) / 2e-4
+        values = []
+        for s in np.linspace(-0.5, 0.5, 801)[:-1] + 0.5 / 800 if max(abs(du), abs(dv)) > 0.3 else [0.0]:
+            x, y = np.clip(j - s * du, 0, width - 1.001), np.clip(i - s * dv, 0, height - 1.001)
+            a, b = int(x), int(y)
+            four = light[b : b + 2, a : a + 2, (i & 1) + (j & 1)]
+            values.append([1 - (y - b), y - b] @ four @ [1 - (x - a), x - a])
+        out[i, j] = np.mean(values)
+    return np.asarray(out * raw_scale[(np.arange(height)[:, None] & 1) + (np.arange(width) & 1)])
+
+
+def test_exposure_agrees_with_its_slow_twin() -> None:
+    rng = np.random.default_rng(5)
+    height, width = 14, 18
+    smooth = cv2.GaussianBlur(rng.uniform(0.05, 0.6, (height, width, 3)).astype(np.float32), (5, 5), 1.5)
+    depth = rng.uniform(2, 9, height * width).astype(np.float32)
+    depth[::7] = np.inf
+    film = Film(smooth.reshape(-1, 3), depth, (np.arange(height * width) % 3).astype(np.int16))
+    v, u = np.mgrid[0:height, 0:width]
+    lines = np.stack([(u - 8.3) / 20.0, (v - 7.1) / 20.0], axis=2).astype(np.float32)
+    moved = rng.normal(0, 0.12, (3, 4, 4))
+    moved[0] = 0.0
+    lens = Optics(20.0, 20.0, (-0.09, 0.06, 0.0004, -0.0003, -0.01))
+    spec, used = SensorSpec(bits=16, white=2.0), Exposure(0.004, 1.0)
+    a, raw = amplifier(spec, used), np.empty((height, width), np.uint16)
+    a = a._replace(noise=0.0)
+    efficiency = np.array(spec.efficiency)
+    flat_field, silence = np.ones((height, width), np.float32), np.zeros((height, width), np.float32)
+    expose(film, lines, moved, lens, flat_field, silence, efficiency, a, raw)
+    expected = naive_expose(film, lines, moved, lens, efficiency * a.electrons * a.numbers)
+    np.testing.assert_allclose(raw, expected, rtol=0.03)
+    assert np.abs(raw.reshape(-1)[::3] - expected.reshape(-1)[::3]).max() <= 1.0  # what stands still
 
 
 # --- the sensor

@@ -34,7 +34,9 @@ from artemis_drivers.virtual.shading import (
     Film,
     Parts,
     ShadowMap,
+    local_mover,
     local_vertices,
+    mover_shadows,
     shade_pixels,
     shadow_map,
 )
@@ -203,6 +205,7 @@ class VirtualCamera:
             scene.surface,
             scene.atlas.arrays,
             self._shadow,
+            mover_shadows(scene, parts, sun),
             parts,
             self._canvas.triangle.reshape(-1),
             self.sub_pixels.reshape(-1, 4),
@@ -222,9 +225,8 @@ class VirtualCamera:
         for k, mover in enumerate(scene.movers, start=1):
             T = _view_of(parts, k)
             if self._within(T[None, :3, 3], np.array([mover.radius]))[0]:
-                local = (mover.mesh.vertices - mover.bvh.origin).astype(np.float32)
                 every = np.arange(len(mover.mesh.triangles), dtype=np.int32)
-                draw(self._canvas, self.view, T, local, mover.mesh.triangles, every, mover.first)
+                draw(self._canvas, self.view, T, local_mover(mover), mover.mesh.triangles, every, mover.first)
 
     def _within(self, centre: F64, radius: F64) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         """Whether spheres (n, 3) in view coordinates may be seen."""

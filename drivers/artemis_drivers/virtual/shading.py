@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from artemis_drivers._jit import kernel, njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32
+from artemis_drivers.virtual.moving import MovingPart
 from artemis_drivers.virtual.scene import Scene, Surface
-from artemis_drivers.virtual.spans import View, draw, new_canvas
+from artemis_drivers.virtual.spans import Canvas, View, draw, new_canvas
 from artemis_drivers.virtual.textures import LEVELS, MACRO, MACRO_M, SIZE, TextureArrays
 
 I16 = NDArray[np.int16]
@@ -18,8 +19,11 @@ I64 = NDArray[np.int64]
 Vector = tuple[Any, Any, Any]  # scalars of a kernel
 
 _SHADOW_M = 0.05  # size of a pixel of the shadow map
-_SHADOW_BIAS_M = 0.06
+_SHADOW_BIAS_M = 0.02
+_STEEPEST = 20.0  # metres of depth per metre of the shadow map for which its pixels are made up
 _LARGEST_SHADOW = 8192
+_MOVER_SHADOW_M = 0.03
+_SHADOW_SEEN_M = 50.0  # movers farther away cast none
 _SUN = (1.25, 1.15, 0.98)  # linear light of the sun and of the sky
 _SKY = (0.42, 0.47, 0.56)
 _SLOW_LOD = float(np.log2(SIZE / MACRO_M))
@@ -35,12 +39,20 @@ class ShadowMap(NamedTuple):
     """What the sun reaches.
 
     ``depth`` float32 (h, w) metres along the sun's rays, inf where nothing; ``rows`` float32 (3, 4) maps
-    local coordinates to column, row and depth; ``sun`` float32 (3,) towards the sun.
+    local coordinates to column, row and depth; ``sun`` float32 (3,) towards the sun; ``pixel`` metres.
     """
 
     depth: F32
     rows: F32
     sun: F32
+    pixel: float
+
+
+class MoverShadows(NamedTuple):
+    """What each of k movers near the camera keeps from the sun, as ShadowMap.depth (k, n, n) and .rows (k, 3, 4)."""
+
+    depth: F32
+    rows: F32
 
 
 class Parts(NamedTuple):
@@ -74,10 +86,7 @@ def local_vertices(scene: Scene) -> F32:
 
 def shadow_map(scene: Scene, sun: F64, local: F32) -> ShadowMap:
     """What the sun sees of what stands still; ``local`` are its vertices relative to the scene's origin."""
-    forward = -sun
-    right = np.cross(forward, [0.0, 0.0, 1.0] if abs(sun[2]) < 0.999 else [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    R = np.stack([right, np.cross(forward, right), forward])
+    R = _sun_axes(sun)
     seen = local @ R.T.astype(np.float32)
     low, high = seen.min(axis=0), seen.max(axis=0)
     pixel = max(_SHADOW_M, float((high - low)[:2].max()) / _LARGEST_SHADOW)
@@ -90,7 +99,42 @@ def shadow_map(scene: Scene, sun: F64, local: F32) -> ShadowMap:
     rows = np.concatenate([R, T[:3, 3:]], axis=1)
     rows[:2] /= pixel
     depth = np.negative(canvas.nearness, out=canvas.nearness)
-    return ShadowMap(depth, rows.astype(np.float32), sun.astype(np.float32))
+    return ShadowMap(depth, rows.astype(np.float32), sun.astype(np.float32), float(pixel))
+
+
+def mover_shadows(scene: Scene, parts: Parts, sun: F64) -> MoverShadows:
+    """What the sun sees of the movers near the camera at the time of an image."""
+    away = np.linalg.norm(parts.R_scene_local[0] @ parts.eye[0] - parts.t_scene_local[1:], axis=1)
+    near = [k for k, m in enumerate(scene.movers) if away[k] - m.radius < _SHADOW_SEEN_M]
+    size = max((int(2 * scene.movers[k].radius / _MOVER_SHADOW_M) + 3 for k in near), default=0)
+    out = MoverShadows(
+        np.full((len(near), size, size), -np.inf, np.float32), np.empty((len(near), 3, 4), np.float32)
+    )
+    no_names = np.empty((0, 0), np.int32)
+    for row, k in enumerate(near):
+        mover, T, R = scene.movers[k], np.eye(4), _sun_axes(sun)
+        T[:3, :3] = R @ parts.R_scene_local[k + 1]
+        view = View(1 / _MOVER_SHADOW_M, 1 / _MOVER_SHADOW_M, size / 2, size / 2, True)
+        every = np.arange(len(mover.mesh.triangles), dtype=np.int32)
+        draw(Canvas(out.depth[row], no_names), view, T, local_mover(mover), mover.mesh.triangles, every, 0)
+        out.rows[row, :, :3], out.rows[row, :, 3] = R, -R @ parts.t_scene_local[k + 1]
+        out.rows[row, :2] /= _MOVER_SHADOW_M
+        out.rows[row, :2, 3] += size / 2
+    np.negative(out.depth, out=out.depth)
+    return out
+
+
+def local_mover(mover: MovingPart) -> F32:
+    """Vertices of a mover in its local frame."""
+    return np.asarray(mover.mesh.vertices - mover.bvh.origin, np.float32)
+
+
+def _sun_axes(sun: F64) -> F64:
+    """Rows: right, down and forward for an eye in the sun."""
+    forward = -sun
+    right = np.cross(forward, [0.0, 0.0, 1.0] if abs(sun[2]) < 0.999 else [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
 
 
 @kernel(forceinline=True)
@@ -108,9 +152,9 @@ def _bilinear(texels: I32, first: int, size: int, u: float, v: float) -> Vector:
     fx, fy = column & (_STEPS - 1), row & (_STEPS - 1)
     mask = size - 1
     column, row = column >> _STEP_BITS, row >> _STEP_BITS
-    left, right = column & mask, (column + 1) & mask
+    # unsigned: no test for counting from the end
+    left, right = np.uint64(column & mask), np.uint64((column + 1) & mask)
     upper, lower = np.uint64(first + (row & mask) * size), np.uint64(first + ((row + 1) & mask) * size)
-    left, right = np.uint64(left), np.uint64(right)  # unsigned: no test for counting from the end
     gx, gy = _STEPS - fx, _STEPS - fy
     total = _lanes(texels[upper + left]) * (gx * gy) + _lanes(texels[upper + right]) * (fx * gy)
     total += _lanes(texels[lower + left]) * (gx * fy) + _lanes(texels[lower + right]) * (fx * fy)
@@ -171,11 +215,14 @@ def _sky(texels: I32, first: int, d0: float, d1: float, d2: float) -> Vector:
 
 
 @kernel(forceinline=True)
-def _sunlit(depth: F32, rows: F32, x: float, y: float, z: float) -> float:
-    """Share of sun 0..1 at a local point: four neighbours of the shadow map, weighted."""
+def _sunlit(depth: F32, rows: F32, x: float, y: float, z: float, slack: float) -> float:
+    """Share of sun 0..1 at a local point: four neighbours of the shadow map, weighted.
+
+    ``slack`` metres deeper than the map counts as lit.
+    """
     u = rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z + rows[0, 3]
     v = rows[1, 0] * x + rows[1, 1] * y + rows[1, 2] * z + rows[1, 3]
-    d = rows[2, 0] * x + rows[2, 1] * y + rows[2, 2] * z + rows[2, 3] - _SHADOW_BIAS_M
+    d = rows[2, 0] * x + rows[2, 1] * y + rows[2, 2] * z + rows[2, 3] - slack
     u0, v0 = int(np.floor(u)), int(np.floor(v))
     if u0 < 0 or v0 < 0 or u0 + 1 >= depth.shape[1] or v0 + 1 >= depth.shape[0]:
         return 1.0
@@ -189,6 +236,20 @@ def _sunlit(depth: F32, rows: F32, x: float, y: float, z: float) -> float:
         lit += (1 - fu) * fv
     if depth[v0 + 1, u0 + 1] >= d:
         lit += fu * fv
+    return lit
+
+
+@kernel(forceinline=True)
+def _past_movers(passing: MoverShadows, x: float, y: float, z: float, slack: float) -> float:
+    """Share of sun 0..1 at a local point that gets past the movers."""
+    lit, size = 1.0, passing.depth.shape[1]
+    for k in range(len(passing.rows)):
+        rows = passing.rows[k]
+        u = rows[0, 0] * x + rows[0, 1] * y + rows[0, 2] * z + rows[0, 3]
+        if 0.0 <= u <= size:
+            v = rows[1, 0] * x + rows[1, 1] * y + rows[1, 2] * z + rows[1, 3]
+            if 0.0 <= v <= size:
+                lit *= _sunlit(passing.depth[k], rows, x, y, z, slack)
     return lit
 
 
@@ -252,6 +313,7 @@ def _shade(
     surface: Surface,
     textures: TextureArrays,
     shadow: ShadowMap,
+    passing: MoverShadows,
     parts: Parts,
     t: int,
     part: int,
@@ -281,7 +343,13 @@ def _shade(
         p = (q[0] + shift[0], q[1] + shift[1], q[2] + shift[2])
     direct = max(n[0] * shadow.sun[0] + n[1] * shadow.sun[1] + n[2] * shadow.sun[2], 0.0)
     if direct > 0.0:
-        direct *= _sunlit(shadow.depth, shadow.rows, p[0], p[1], p[2])
+        # a surface seen at a slant by the sun is that much deeper at the next pixel of the map
+        slope = 1.42 * min(np.sqrt(max(1.0 - direct * direct, 0.0)) / direct, _STEEPEST)
+        slack = _SHADOW_BIAS_M + shadow.pixel * slope
+        direct *= _sunlit(shadow.depth, shadow.rows, p[0], p[1], p[2], slack)
+        if direct > 0.0:
+            slack = _SHADOW_BIAS_M + _MOVER_SHADOW_M * slope
+            direct *= _past_movers(passing, p[0], p[1], p[2], slack)
     sky = 0.62 + 0.38 * n[2]
     r = paint[0] * (_SUN[0] * direct + _SKY[0] * sky)
     g = paint[1] * (_SUN[1] * direct + _SKY[1] * sky)
@@ -314,6 +382,7 @@ def shade_pixels(
     surface: Surface,
     textures: TextureArrays,
     shadow: ShadowMap,
+    passing: MoverShadows,
     parts: Parts,
     ids: I32,
     canvas: I32,
@@ -335,7 +404,7 @@ def shade_pixels(
         if same:
             part = _part_of(parts.first, first)
             x, y = lines[i, 4, 0], lines[i, 4, 1]
-            r, g, b, z = _shade(surface, textures, shadow, parts, first, part, x, y, wide)
+            r, g, b, z = _shade(surface, textures, shadow, passing, parts, first, part, x, y, wide)
             film.light[i, 0], film.light[i, 1], film.light[i, 2] = r, g, b
             film.depth[i], film.part[i] = z, part
             continue
@@ -348,7 +417,7 @@ def shade_pixels(
                 continue
             part = _part_of(parts.first, t)
             x, y = lines[i, k, 0], lines[i, k, 1]
-            r, g, b, z = _shade(surface, textures, shadow, parts, t, part, x, y, 0.7 * wide)
+            r, g, b, z = _shade(surface, textures, shadow, passing, parts, t, part, x, y, 0.7 * wide)
             film.light[i, 0] += weight * r
             film.light[i, 1] += weight * g
             film.light[i, 2] += weight * b
