@@ -17,7 +17,8 @@ _BRIDGE = 5  # triggers in a row whose messages may be missing
 _REACH = 50  # triggers searched on either side after a mismatch
 _STRAY_FRAMES = 5  # frames in a row that fit no trigger: the anchor is wrong
 _PENDING = 100  # frames that may wait for their trigger
-_RECENT = 32  # frames back in which a repeated or reordered one is recognised
+_RECENT = 32  # frames back in which a repeated one is recognised
+_REORDERED = 4  # numbers that a late frame may be behind
 _AGREEING = 3  # frames whose arrival must name the same anchor
 _SKEW = 400e-6  # most that two quartz clocks differ, with a margin
 _PATIENCE_NS = 1_000_000_000
@@ -123,6 +124,14 @@ class TriggerHistory:
                 return self._edges[count] - self._edges[count - 1]
         return None
 
+    def estimate(self, count: int) -> int | None:
+        """Board time of a trigger that was never told, by the next one that was, and the period."""
+        period = self.period_ns()
+        after = next((c for c in range(count + 1, count + _REACH) if c in self._edges), None)
+        if period is None or after is None:
+            return None
+        return self._edges[after] - (after - count) * period
+
     def nearest(self, board_ns: int) -> int | None:
         """Count of the trigger nearest to a time, by the latest one and the period; None if unknown."""
         period = self.period_ns()
@@ -194,7 +203,7 @@ class FramePairing:
         later = frame.device_ns - self._highest.device_ns
         if ahead > 0:
             return later <= 0
-        return frame.sequence in self._recent or later >= 0 or ahead < -_RECENT
+        return frame.sequence in self._recent or later >= 0 or ahead < -_REORDERED
 
     def _restarted(self) -> None:
         self.unanchor()
@@ -235,7 +244,7 @@ class FramePairing:
         count = frame.sequence + self.anchor
         slip = self._slip(frame, count)
         if slip is None:
-            return None if count >= self.history.latest else "unpaired_no_trigger"
+            return None if count >= self.history.latest else self._give_up(frame, count)
         if slip == 0:
             return self._accept(frame, count)
         count += slip
@@ -246,6 +255,13 @@ class FramePairing:
         self.anchor += slip
         self.counts["reanchored"] += 1
         return self._accept(frame, count)
+
+    def _give_up(self, frame: FrameStamp, count: int) -> str:
+        """Its trigger was never told. The interval from it still tells whether the next frame slipped."""
+        edge = self.history.estimate(count)
+        if self._last is None and edge is not None:
+            self._last = _Last(count, edge, frame.start_ns)
+        return "unpaired_no_trigger"
 
     def _slip(self, frame: FrameStamp, count: int) -> int | None:
         """By how many triggers the interval since the last pair says that ``count`` is wrong; None: unknown.
@@ -268,7 +284,7 @@ class FramePairing:
         found = self.history.edge(count)
         assert found is not None
         edge_ns, interpolated = found
-        if self._came_before(frame, edge_ns):
+        if self._contradicted(frame, edge_ns):
             return self._reject()
         self._stray = 0
         self._last = _Last(count, edge_ns, frame.start_ns)
@@ -277,10 +293,12 @@ class FramePairing:
         mid_ns = edge_ns + delay + exposure // 2
         return Pair(frame, count, edge_ns, mid_ns, interpolated, strobe is not None)
 
-    def _came_before(self, frame: FrameStamp, edge_ns: int) -> bool:
-        """No photograph arrives before it was triggered: arrival cannot pair, but it can refute."""
+    def _contradicted(self, frame: FrameStamp, edge_ns: int) -> bool:
+        """Arrival cannot pair, but it can refute: nothing arrives before it was triggered, or seconds later."""
         arrival, period = self.board_of_host(frame.rx_ns), self.history.period_ns()
-        return arrival is not None and period is not None and arrival < edge_ns - period // 4
+        if arrival is None or period is None:
+            return False
+        return not -period // 4 <= arrival - edge_ns <= frame.exposure_ns + _PATIENCE_NS
 
     def _reject(self) -> str:
         self._stray += 1

@@ -191,26 +191,27 @@ def test_a_change_of_rate_is_not_interpolated_across() -> None:
 @hypothesis_settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_no_wrong_pair_whatever_is_lost(seed: int) -> None:
-    """Frames lost, missed, repeated, late; triggers lost; the camera may restart."""
+    """Up to 30 % each of frames lost, exposures missed and triggers not told; repeats; the camera restarts."""
     rng = np.random.default_rng(seed)
     bench = Bench()
     truth: dict[tuple[int, int], int] = {}
     sequence, offset = 0, CAMERA_OFFSET
     restart = int(rng.integers(20, 100))
+    lost, missed, untold = rng.uniform(0, 0.3, 3)
     for k in range(120):
-        if rng.uniform() > 0.1:
+        if rng.uniform() > untold:
             bench.trigger(k)
         if k == restart:
-            sequence, offset = 0, int(rng.integers(-(10**12), 10**12))
-        if rng.uniform() < 0.05:
+            sequence, offset = int(rng.integers(0, 3)), int(rng.integers(-(10**12), 10**12))
+        if rng.uniform() < missed:
             continue
         stamp = bench.frame(k, sequence, offset + int(rng.normal(0, 50_000)), int(rng.exponential(2e6)))
         sequence += 1
         truth[stamp.sequence, stamp.device_ns] = k
-        for _ in range(int(rng.uniform() > 0.1) + int(rng.uniform() < 0.05)):
+        for _ in range(int(rng.uniform() > lost) + int(rng.uniform() < 0.05)):
             bench.pairs += bench.pairing.add(stamp)
     assert all(pair.count == truth[pair.frame.sequence, pair.frame.device_ns] for pair in bench.pairs)
-    assert len(bench.pairs) > 70
+    assert len(bench.pairs) > 20
 
 
 @given(st.lists(st.builds(FrameStamp, *(st.integers(-(2**62), 2**62) for _ in range(4))), max_size=30))

@@ -10,7 +10,7 @@ from artemis_drivers.base import DriverError, State
 from artemis_drivers.imu_serial import configure, vectornav
 from artemis_drivers.imu_serial.configure import configure_mti, configure_vectornav
 from artemis_drivers.imu_serial.driver import IMU_CHUNK, SerialImu
-from artemis_drivers.imu_serial.link import open_serial
+from artemis_drivers.imu_serial.link import SerialPort
 from artemis_drivers.imu_serial.mtdata2 import Type
 from artemis_drivers.imu_serial.samples import IMU_SAMPLE
 from artemis_drivers.imu_serial.settings import MtiSettings, SyncSetting, VectorNavSettings
@@ -123,9 +123,9 @@ def test_configuration_is_read_back(tmp_path: Path) -> None:
     rig.start()
     try:
         path = str(tmp_path / "mti")
-        port = open_serial(path, 115_200)
+        port = SerialPort(path, 115_200)
         with pytest.raises(DriverError, match="used by another program"):
-            open_serial(path, 115_200)
+            SerialPort(path, 115_200)
         rounded = MtiSettings(path, baud=2_000_000, rate_hz=1000, sync=(SyncSetting(9, 2),))
         status = {item.item: item.status for item in configure_mti(port, rounded)}
         assert status == {"baud": "ok", "device id": "ok", "outputs": "rounded", "sync": "ok", "mode": "ok"}
@@ -147,7 +147,7 @@ def test_outputs_that_do_not_fit_the_line_are_refused() -> None:
 
 def test_a_port_that_is_not_there_is_named() -> None:
     with pytest.raises(DriverError, match=r"/dev/nowhere is not there"):
-        open_serial("/dev/nowhere", 115_200)
+        SerialPort("/dev/nowhere", 115_200)
 
 
 class ScriptedVectorNav:
@@ -159,18 +159,14 @@ class ScriptedVectorNav:
         self.registers = {3: "0100012345", 5: str(baud), 6: "14", 75: "0,0,0"}
         self._out = bytearray(bytes.fromhex("fa01080093502e42833ef13f48b504bb9288"))
 
-    @property
-    def in_waiting(self) -> int:
-        return len(self._out)
-
-    def read(self, size: int = 1, /) -> bytes:
+    def chunk(self) -> bytes:
         if not self._out:
             time.sleep(0.001)
-        data = bytes(self._out[:size])
-        del self._out[:size]
+        data = bytes(self._out)
+        self._out.clear()
         return data
 
-    def write(self, data: bytes, /) -> int:
+    def write(self, data: bytes) -> None:
         if self.baudrate == self.baud:
             command, number, *values = vectornav.line_text(data).split(",")
             register = int(number)
@@ -179,7 +175,6 @@ class ScriptedVectorNav:
             answer = vectornav.line(f"{command},{number},{self.registers[register]}")
             self.baud = int(self.registers[5])
             self._out += answer
-        return len(data)
 
     def close(self) -> None:
         self.baudrate = 0
@@ -224,3 +219,20 @@ def test_vectornav_samples_carry_the_sync_input() -> None:
     _, rows = RingReader(samples, from_oldest=True).read()
     assert rows["sync_in_ns"].tolist() == [999_000_000] * 3
     assert rows["sync_in_count"].tolist() == [7] * 3 and rows["count"].tolist() == [0, 1, 2]
+
+
+def test_samples_that_are_no_numbers_are_counted() -> None:
+    samples, _ = rings()
+    driver = SerialImu(VectorNavSettings("x", rate_hz=200), samples)
+    masks = (configure.VECTORNAV_FIELDS, 0, 0)
+    for startup, rate in ((2**63, 0.0), (5, float("nan")), (5, float("inf")), (10, 1.0)):
+        fields = {
+            "common.time_startup_ns": (startup,),
+            "common.time_sync_in_ns": (2**64 - 1,),
+            "common.angular_rate": (rate, 0.0, 0.0),
+            "common.acceleration": (0.0, 0.0, 0.0),
+            "common.sync_in_count": (2**32 - 1,),
+        }
+        driver.take(vectornav.encode(vectornav.BinaryMessage(masks, fields)), 1)
+    assert samples.published == 1 and driver.health()[0].counters["malformed_frames"] == 3
+    assert samples.field["sync_in_ns"][0] == -1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import termios
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -10,7 +9,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from artemis_drivers.base import Applied, DriverError, Health, State
-from artemis_drivers.imu_serial.link import Port, open_serial, read_chunk
+from artemis_drivers.imu_serial.link import Port, SerialPort
 from artemis_drivers.imu_serial.mtdata2 import MalformedError
 from artemis_drivers.imu_serial.samples import IMU_SAMPLE, Sample, protocol
 from artemis_drivers.imu_serial.settings import ImuSettings
@@ -33,7 +32,7 @@ class SerialImu:
         settings: ImuSettings,
         samples: Ring,
         chunks: Ring | None = None,
-        open_port: Callable[[str, int], Port] = open_serial,
+        open_port: Callable[[str, int], Port] = SerialPort,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         if samples.dtype != IMU_SAMPLE or (chunks is not None and chunks.dtype != IMU_CHUNK):
@@ -93,7 +92,7 @@ class SerialImu:
         while not self._stop.is_set():
             try:
                 port = self._connect()
-            except (DriverError, OSError, termios.error) as fault:
+            except (DriverError, OSError) as fault:
                 self._become(State.SEARCHING, str(fault))
                 self._stop.wait(_RETRY_S[min(failures, len(_RETRY_S) - 1)])
                 failures += 1
@@ -125,8 +124,8 @@ class SerialImu:
         # No pause to collect bytes: it would beat with the sample rate, and the least delay never be seen.
         while not self._stop.is_set():
             try:
-                chunk = read_chunk(port)
-            except (OSError, termios.error):
+                chunk = port.chunk()
+            except OSError:
                 self._counts["unplugged"] += 1
                 self._become(State.SEARCHING, f"{self.settings.name} was unplugged: plug it in again")
                 return

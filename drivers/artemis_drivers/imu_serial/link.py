@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import select
+import termios
 import time
 from collections import deque
 from collections.abc import Callable
@@ -18,20 +21,15 @@ _CHUNK = 4096
 
 
 class Port(Protocol):
-    """What is used of serial.Serial."""
+    """A serial port. ``baudrate`` can be set while it is open."""
 
     baudrate: int
 
-    @property
-    def in_waiting(self) -> int:
-        """Bytes that can be read at once."""
+    def chunk(self) -> bytes:
+        """What has arrived, waiting up to READ_TIMEOUT_S for the first byte; OSError if the device is gone."""
         ...
 
-    def read(self, size: int = 1, /) -> bytes:
-        """Up to ``size`` bytes; fewer, or none, after the port's timeout."""
-        ...
-
-    def write(self, data: bytes, /) -> int | None:
+    def write(self, data: bytes) -> None:
         """Send."""
         ...
 
@@ -40,22 +38,49 @@ class Port(Protocol):
         ...
 
 
-def open_serial(path: str, baud: int) -> Port:
-    """The port for us alone, with the least latency it offers; DriverError if it cannot be opened."""
-    try:
-        port = serial.Serial(path, baud, timeout=READ_TIMEOUT_S, write_timeout=1.0, exclusive=True)
-    except (OSError, ValueError) as fault:
-        raise DriverError(_why_not(path, fault)) from fault
-    # USB converters otherwise hold bytes back for 16 ms; a pseudo terminal has no such mode
-    with contextlib.suppress(OSError, ValueError, NotImplementedError):
-        port.set_low_latency_mode(True)
-    return port  # type: ignore[no-any-return]
+class SerialPort:
+    """A port of the operating system, for us alone, with the least latency it offers."""
 
+    def __init__(self, path: str, baud: int) -> None:
+        """DriverError if it cannot be opened."""
+        try:
+            self._port = serial.Serial(path, baud, timeout=0, write_timeout=1.0, exclusive=True)
+        except (OSError, ValueError) as fault:
+            raise DriverError(_why_not(path, fault)) from fault
+        # USB converters otherwise hold bytes back for 16 ms; a pseudo terminal has no such mode
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
+            self._port.set_low_latency_mode(True)
 
-def read_chunk(port: Port) -> bytes:
-    """What has arrived, waiting up to READ_TIMEOUT_S for the first byte; OSError if the device is gone."""
-    first = port.read(1)
-    return first + port.read(min(port.in_waiting, _CHUNK)) if first else first
+    @property
+    def baudrate(self) -> int:
+        """Symbols a second."""
+        return int(self._port.baudrate)
+
+    @baudrate.setter
+    def baudrate(self, value: int) -> None:
+        try:
+            self._port.baudrate = value
+        except termios.error as fault:
+            raise OSError(*fault.args) from fault
+
+    def chunk(self) -> bytes:
+        """See Port. Read directly: pyserial asks the system five times for what takes two."""
+        descriptor = self._port.fileno()
+        ready, _, _ = select.select([descriptor], [], [], READ_TIMEOUT_S)
+        if not ready:
+            return b""
+        data = os.read(descriptor, _CHUNK)
+        if not data:
+            raise OSError("the device is gone")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        self._port.write(data)
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._port.close()
 
 
 class Link:
@@ -79,7 +104,7 @@ class Link:
                 self.other_frames += 1
             if time.monotonic() > until:
                 return None
-            chunk = read_chunk(self.port)
+            chunk = self.port.chunk()
             self._waiting.extend(self._splitter.feed(chunk) if chunk else self._splitter.abandon())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,9 @@ IMU_SAMPLE = np.dtype(
 """One sample: host time of its chunk, device time, sample number, samples lost just before it, restarts of
 the device; rad/s and m/s2 in the IMU's axes; pulses on its sync input and device time of the last one
 (-1 without)."""
+
+
+_LONGEST_NS = 2**62
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +93,7 @@ def mti_sample(frame: bytes) -> Sample | None:
         ticks, counter = values[Type.SAMPLE_TIME_FINE][0], values[Type.PACKET_COUNTER][0]
     except KeyError as missing:
         raise MalformedError("a sample without counter or time") from missing
+    _require_finite(gyro, accel)
     return Sample(ticks, counter, gyro, accel, values.get(Type.STATUS_WORD, (0,))[0])
 
 
@@ -102,6 +107,9 @@ def vectornav_sample(frame: bytes) -> Sample | None:
         return None
     if "common.time_startup_ns" not in fields:
         raise MalformedError("a sample without its time")
+    if fields["common.time_startup_ns"][0] >= _LONGEST_NS:
+        raise MalformedError("a sample of a device that runs since a century")
+    _require_finite(gyro, accel)
     return Sample(
         fields["common.time_startup_ns"][0],
         0,
@@ -111,3 +119,8 @@ def vectornav_sample(frame: bytes) -> Sample | None:
         fields.get("common.sync_in_count", (-1,))[0],
         fields.get("common.time_sync_in_ns", (-1,))[0],
     )
+
+
+def _require_finite(gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
+    if not math.isfinite(sum(gyro) + sum(accel)):
+        raise MalformedError("a sample that is no number")
