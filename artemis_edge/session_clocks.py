@@ -21,6 +21,13 @@ _HELD_RATE = 1e-6  # how well a rate that was measured over a minute holds
 _DELAYS = 1000
 
 
+def epoch_of(count: int, wall_ns: int) -> int:
+    """Epoch of a session: time of pulse 0, so that pulse ``count``, seen at ``wall_ns`` since 1970, is at the
+    nearest whole second. Taken once, and recorded: session time never follows the wall clock afterwards.
+    """
+    return ((wall_ns + SECOND_NS // 2) // SECOND_NS - count) * SECOND_NS
+
+
 class ClockState(StrEnum):
     """How far a clock can be trusted."""
 

@@ -105,7 +105,9 @@ class Synchroniser:
             return []
         if event.series != self._series:
             self._new_series(event.series)
-        self._armed = False
+        elif self._armed:  # it was on its way when the board was armed
+            self.undated["trigger before arm"] += 1
+            return []
         self.history.add(event.count, event.board_ns)
         return self.advance(event.rx_ns)
 
@@ -219,6 +221,7 @@ class Synchroniser:
         if not self._armed:
             for pairing in self.pairings.values():
                 pairing.unanchor()
+        self._armed = False
 
     def _board_of_host(self, host_ns: int) -> int | None:
         model = self._host.model(self._skew_by_lidar())

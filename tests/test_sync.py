@@ -11,7 +11,7 @@ import pytest
 from artemis_drivers.trigger.events import TRIGGER_EVENT, Kind
 from artemis_drivers.trigger.messages import PPS_GENERATED
 
-from artemis_edge.session_clocks import ClockState, LidarClock, LidarTime, PulseClock
+from artemis_edge.session_clocks import ClockState, LidarClock, LidarTime, PulseClock, epoch_of
 from artemis_edge.sync import BoardEvent, CameraTiming, FrameStamp, Synchroniser
 from tests.sync_rig import EPOCH_NS, Outcome, Run, Spec
 
@@ -116,6 +116,11 @@ def test_the_rate_of_pulses_from_outside_is_measured_and_carried() -> None:
     assert "for 31 s" in report.message and report.doubt_ns > 30_000
 
 
+def test_the_epoch_makes_a_pulse_the_nearest_whole_second() -> None:
+    assert epoch_of(7, 1000 * SECOND + 400_000_000) == 993 * SECOND
+    assert epoch_of(7, 1000 * SECOND - 400_000_000) == 993 * SECOND
+
+
 def test_a_glitch_is_no_pulse() -> None:
     clock = PulseClock(0)
     pulses(clock, range(5))
@@ -203,6 +208,26 @@ def test_a_board_that_restarts_never_sets_time_back() -> None:
     after = sync.session_of_host(9100 * SECOND + 200_000_000)
     assert after == 1101 * SECOND  # the first whole second that is not before 1100.1 s
     assert sync.pulse.restarts == 1 and sync.utc_of_pulse(0) == 1101 * SECOND
+
+
+def test_a_trigger_on_its_way_while_arming_spoils_nothing() -> None:
+    sync = Synchroniser({"cam": CameraTiming(0, None)}, {}, 1000 * SECOND)
+    sync.board_event(event(Kind.PPS, 0, 0))
+    for k in range(3):
+        sync.board_event(event(Kind.TRIGGER, k, (k + 1) * 100_000_000))
+    sync.arm({"cam": 0})
+    sync.board_event(event(Kind.TRIGGER, 3, 400_000_000))
+    assert sync.undated == {"trigger before arm": 1}
+    images = []
+    for k in range(4):
+        edge = 900_000_000 + k * 100_000_000
+        images += sync.board_event(event(Kind.TRIGGER, k, edge, series=1))
+        frame = FrameStamp(k, edge + 2_000_000, 2_000_000, edge + 9000 * SECOND + 22_000_000)
+        images += sync.image("cam", frame)
+    assert [image.pair.count for image in images] == [0, 1, 2, 3]
+    assert images[0].stamp_ns == 1000 * SECOND + 901_000_000
+    sync.board_event(event(Kind.TRIGGER, 0, 2 * SECOND, series=2))  # nobody armed: which frame is next?
+    assert sync.pairings["cam"].anchor is None
 
 
 def test_strobes_and_rows_of_a_ring() -> None:
