@@ -423,7 +423,7 @@ def test_exposure_agrees_with_its_slow_twin() -> None:
     a = a._replace(noise=0.0)
     efficiency = np.array(spec.efficiency)
     flat_field, silence = np.ones((height, width), np.float32), np.zeros((height, width), np.float32)
-    expose(film, lines, moved, lens, flat_field, silence, efficiency, a, raw)
+    expose(film, lines, moved, lens, flat_field, silence, efficiency, a, (0, height), raw)
     expected = naive_expose(film, lines, moved, lens, efficiency * a.electrons * a.numbers)
     np.testing.assert_allclose(raw, expected, rtol=0.03)
     assert np.abs(raw.reshape(-1)[::3] - expected.reshape(-1)[::3]).max() <= 1.0  # what stands still
@@ -444,7 +444,18 @@ def numbers(spec: SensorSpec, used: Exposure, light: float, seed: int = 0) -> F6
     lens = Optics(100.0, 100.0, (0.0, 0.0, 0.0, 0.0, 0.0))
     lines, falloff = np.zeros((64, 96, 2), np.float32), np.ones((64, 96), np.float32)
     D = np.zeros((1, 4, 4))
-    expose(flat(light), lines, D, lens, falloff, noise, np.array(spec.efficiency), amplifier(spec, used), raw)
+    expose(
+        flat(light),
+        lines,
+        D,
+        lens,
+        falloff,
+        noise,
+        np.array(spec.efficiency),
+        amplifier(spec, used),
+        (0, 64),
+        raw,
+    )
     return raw.astype(np.float64)
 
 
@@ -486,6 +497,7 @@ def test_mosaic_is_developed_to_the_colour_that_came_in() -> None:
             zero,
             np.array(spec.efficiency),
             amplifier(spec, REFERENCE),
+            (0, 64),
             raw,
         )
         bgr = developed(raw, spec)[8:-8, 8:-8].reshape(-1, 3)
@@ -527,7 +539,7 @@ def test_photographs_are_reproducible_and_noisy(town: tuple[World, Scene]) -> No
     world, scene = town
     T = looking(20.0, 0.0, 1.6)
     spec = CameraSpec().scaled(96)
-    first, second = (VirtualCamera(spec, 6) for _ in range(2))
+    first, second = VirtualCamera(spec, 6), VirtualCamera(spec, 6, threads=3)
     one, two = (c.photograph(scene, world.sun, lambda t: T, 0.5, 0) for c in (first, second))
     assert one == two and one.encoding == "jpeg" and one.data[:2] == b"\xff\xd8"
     again = first.photograph(scene, world.sun, lambda t: T, 0.5, 1)

@@ -9,6 +9,7 @@ a mover's silhouette uncovers within the exposure, lens blur, rolling shutter, f
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -114,11 +115,13 @@ def undistort(xd: F64, yd: F64, k: tuple[float, float, float, float, float]) -> 
 @dataclass(slots=True)
 class VirtualCamera:
     """Takes photographs of a scene; keeps what does not change from image to image, and the exposure control:
-    photographs must be taken in order.
+    photographs must be taken in order. Kernels work on ``threads`` bands of the image at once; the result does
+    not depend on their number.
     """
 
     spec: CameraSpec
     seed: int
+    threads: int = 2
     lines: F32 = field(init=False)
     sub_pixels: I32 = field(init=False)
     view: View = field(init=False)
@@ -130,6 +133,7 @@ class VirtualCamera:
     _scene: Scene | None = field(default=None, init=False)
     _shadow: ShadowMap = field(init=False)
     _local: F32 = field(init=False)
+    _pool: ThreadPoolExecutor = field(init=False)
 
     def __post_init__(self) -> None:
         """Lines of sight of all sub-pixels and where they fall on the undistorted canvas."""
@@ -157,6 +161,7 @@ class VirtualCamera:
         self._falloff = (cosine**s.vignetting).astype(np.float32)
         self._noise = white_noise(s.height, s.width, self.seed)
         self._exposure = AutoExposure(s.sensor)
+        self._pool = ThreadPoolExecutor(self.threads)
 
     def render(self, scene: Scene, sun: F64, T_world_cam: F64, time_s: float = 0.0) -> F32:
         """Linear light float32 (h, w, 3), 1 = white: no blur, no vignetting, no noise."""
@@ -180,17 +185,15 @@ class VirtualCamera:
     ) -> np.ndarray[tuple[int, int], np.dtype[np.uint16]]:
         s = self.spec
         raw = np.empty((s.height, s.width), np.uint16)
-        expose(
-            self._film,
-            self.lines[:, :, 4],
-            _moved(scene, parts, path, time_s, used.exposure_s),
-            Optics(s.fx, s.fy, s.distortion),
-            self._falloff,
-            cut(self._noise, self.seed, index),
-            np.array(s.sensor.efficiency),
-            amplifier(s.sensor, used),
-            raw,
-        )
+        moved = _moved(scene, parts, path, time_s, used.exposure_s)
+        lens, noise = Optics(s.fx, s.fy, s.distortion), cut(self._noise, self.seed, index)
+        efficiency, amplified = np.array(s.sensor.efficiency), amplifier(s.sensor, used)
+
+        def band(first: int, last: int) -> None:
+            lines, rows = self.lines[:, :, 4], (first, last)
+            expose(self._film, lines, moved, lens, self._falloff, noise, efficiency, amplified, rows, raw)
+
+        self._in_bands(band)
         return raw
 
     def _see(self, scene: Scene, sun: F64, T_world_cam: F64, time_s: float) -> Parts:
@@ -201,19 +204,24 @@ class VirtualCamera:
             self._scene = scene
         parts = _parts(scene, T_world_cam, time_s)
         self._draw(scene, parts)
-        shade_pixels(
-            scene.surface,
-            scene.atlas.arrays,
-            self._shadow,
-            mover_shadows(scene, parts, sun),
-            parts,
-            self._canvas.triangle.reshape(-1),
-            self.sub_pixels.reshape(-1, 4),
-            self.lines.reshape(-1, 5, 2),
-            1.0 / self.spec.fx,
-            self._film,
-        )
+        passing, arrays = mover_shadows(scene, parts, sun), scene.atlas.arrays
+        ids, wide, width = self._canvas.triangle.reshape(-1), 1.0 / self.spec.fx, self.spec.width
+        sub_pixels, lines = self.sub_pixels.reshape(-1, 4), self.lines.reshape(-1, 5, 2)
+
+        def band(first: int, last: int) -> None:
+            n = slice(first * width, last * width)
+            film = Film(self._film.light[n], self._film.depth[n], self._film.part[n])
+            shade_pixels(
+                scene.surface, arrays, self._shadow, passing, parts, ids, sub_pixels[n], lines[n], wide, film
+            )
+
+        self._in_bands(band)
         return parts
+
+    def _in_bands(self, work: Callable[[int, int], None]) -> None:
+        """Do work(first, last) on bands of rows that together are the image."""
+        edges = [k * self.spec.height // self.threads for k in range(self.threads + 1)]
+        list(self._pool.map(work, edges[:-1], edges[1:]))
 
     def _draw(self, scene: Scene, parts: Parts) -> None:
         """Numbers of the triangles seen per canvas pixel; only objects within the view are drawn."""

@@ -198,17 +198,18 @@ def expose(
     noise: F32,
     efficiency: F64,
     amplifier: Amplifier,
+    rows: tuple[int, int],
     raw: U16,
 ) -> None:
     """Numbers of the mosaic (red at even rows and columns, blue at odd ones) into ``raw`` (h, w).
 
     ``lines`` float32 (h, w, 2) x / z and y / z; ``moved`` (k, 4, 4) per part the matrix D by which a point p of
     it, in camera coordinates, moves over the exposure: by D (p, 1); ``falloff`` (h, w) vignetting; ``noise``
-    (h, w) white, unit variance.
+    (h, w) white, unit variance. Only ``rows`` first to before last are made.
     """
     height, width = raw.shape
     light = film.light.reshape(height, width, 3)
-    for i in range(height):
+    for i in range(rows[0], rows[1]):
         for j in range(width):
             n, colour = i * width + j, (i & 1) + (j & 1)
             x, y, part = lines[i, j, 0], lines[i, j, 1], film.part[n]
