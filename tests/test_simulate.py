@@ -16,12 +16,14 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.ply import Mesh, bare_mesh, read_mesh, read_points
 from artemis_edge.frames import F32, F64
 from artemis_edge.session import simulate as sim
-from artemis_edge.session import truth
-from artemis_edge.session.messages import CompressedImage, Imu, PointCloud2, TFMessage
+from artemis_edge.session import true_views, truth
+from artemis_edge.session.messages import CameraExposure, CompressedImage, Image, Imu, PointCloud2, TFMessage
+from artemis_edge.session.rig import START_NS
+from artemis_edge.session.truth_files import POINT_TRUTH, POINTS_TOPIC
 from artemis_edge.session.writer import POINT
 from artemis_edge.trajectory import interpolate, read_tum
 
-FAST = {"image_width": "96", "density": "0.5", "reach_m": "60", "reference_spacing_m": "0.05"}
+FAST = {"image_width": "96", "truth_images": "2", "density": "0.5", "reach_m": "60", "reference_spacing_m": "0.05"}
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +37,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert summary.beams == 25 * 12_000
     assert 0.6 * summary.beams < summary.points < summary.beams
     assert summary.reference_points > 50_000
+    assert summary.views == 2
     return out
 
 
@@ -51,6 +54,13 @@ def clouds(path: Path) -> list[tuple[int, np.ndarray]]:  # type: ignore[type-arg
     return out
 
 
+def point_truths(path: Path) -> list[np.ndarray]:  # type: ignore[type-arg]
+    return [
+        np.frombuffer(bytes(PointCloud2.decode(data).data), POINT_TRUTH)
+        for data in messages(path, POINTS_TOPIC)
+    ]
+
+
 def test_topics_rates_and_order(session: Path) -> None:
     with (session / "session.mcap").open("rb") as file:
         reader = make_reader(file)
@@ -64,10 +74,10 @@ def test_topics_rates_and_order(session: Path) -> None:
     log = [t for topic, t, _ in rows if topic != "/tf_static"]
     assert log == sorted(log)
     stamps = [p for topic, _, p in rows if topic == "/lidar/points"]
-    assert stamps == [sim.START_NS + k * 100_000_000 for k in range(25)]
+    assert stamps == [START_NS + k * 100_000_000 for k in range(25)]
     assert all(stamp % 100_000_000 == 0 for stamp in stamps)
     imu = np.array([p for topic, _, p in rows if topic == "/imu"])
-    assert (np.diff(imu) == 5_000_000).all() and imu[0] == sim.START_NS
+    assert (np.diff(imu) == 5_000_000).all() and imu[0] == START_NS
     photos = [p for topic, _, p in rows if topic == "/camera/image/compressed"]
     assert photos == [stamp + 50_000_000 for stamp in stamps]
 
@@ -77,11 +87,13 @@ def test_points_lie_on_the_world_when_moved_by_the_truth(session: Path) -> None:
     reference = read_points(session / "truth" / "reference.ply").points
     tree = cKDTree(reference)
     distance = []
-    for stamp, cloud in clouds(session / "session.mcap")[::6]:
+    said = point_truths(session / "truth" / "points.mcap")
+    for (stamp, cloud), point in list(zip(clouds(session / "session.mcap"), said, strict=True))[::6]:
         points = np.column_stack([cloud["x"], cloud["y"], cloud["z"]]).astype(np.float64)
         T = interpolate(poses, stamp + cloud["t"].astype(np.int64))
         world = np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
-        near = np.linalg.norm(points, axis=1) < 25
+        near = (np.linalg.norm(points, axis=1) < 25) & (point["moving"] == 0) & (point["mixed"] == 0)
+        assert near.mean() > 0.25
         distance.append(tree.query(world[near])[0])
     joined = np.concatenate(distance)
     assert np.median(joined) < 0.035  # 2 cm of noise, 5 cm between reference points
@@ -99,7 +111,7 @@ def test_lines_and_times_are_those_of_the_sensor(session: Path) -> None:
 
 def test_world_frame_is_the_first_lidar_frame_levelled(session: Path) -> None:
     poses = read_tum(session / "truth" / "trajectory.tum")
-    assert len(poses) == 25 and poses.stamp_ns[0] == sim.START_NS
+    assert len(poses) == 25 and poses.stamp_ns[0] == START_NS
     np.testing.assert_allclose(poses.T_world_lidar[0], np.eye(4), atol=2e-6)
     dense = read_tum(session / "truth" / "trajectory_400hz.tum")
     assert len(dense) == 1001

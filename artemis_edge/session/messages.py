@@ -261,6 +261,29 @@ class Image(Message):
 
 
 @dataclass(frozen=True, slots=True)
+class CameraExposure(Message):
+    """artemis_msgs/msg/CameraExposure: exposure time (s) and gain (1: none) of the image of the same stamp."""
+
+    ROS_TYPE: ClassVar[str] = "artemis_msgs/msg/CameraExposure"
+    header: Header
+    exposure_s: float
+    gain: float
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.write("d", self.exposure_s)
+        cdr.write("d", self.gain)
+        return cdr.finish()
+
+    @classmethod
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
+        return cls(Header.read(cdr), cdr.read("d"), cdr.read("d"))
+
+
+@dataclass(frozen=True, slots=True)
 class CameraInfo(Message):
     """sensor_msgs/msg/CameraInfo: ``k`` (9,), ``r`` (9,), ``p`` (12,) row-major, ``d`` of the model."""
 

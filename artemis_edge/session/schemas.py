@@ -1,7 +1,8 @@
 """ROS 2 message definitions (``ros2msg`` text) of every type that a session may hold.
 
-The interfaces are those of the ROS 2 common_interfaces, geometry2 and livox_ros_driver2 packages; the texts
-carry the fields alone. A schema in a file is the definition followed by those it depends on.
+The interfaces are those of the ROS 2 common_interfaces, geometry2 and livox_ros_driver2 packages, and our own
+``artemis_msgs`` for what these have no place for; the texts carry the fields alone. A schema in a file is the
+definition followed by those it depends on.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ _DEFINITIONS = {
         "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n"
         "sensor_msgs/RegionOfInterest roi\n"
     ),
+    "artemis_msgs/CameraExposure": "std_msgs/Header header\nfloat64 exposure_s\nfloat64 gain\n",
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
     "nav_msgs/Odometry": (
         "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"

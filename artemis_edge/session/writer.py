@@ -26,9 +26,11 @@ from artemis_edge.errors import RunError
 from artemis_edge.frames import F32, F64, U8, CameraModel
 from artemis_edge.session.messages import (
     FIELD_TYPES,
+    CameraExposure,
     CameraInfo,
     CompressedImage,
     Header,
+    Image,
     Imu,
     Message,
     Odometry,
@@ -115,11 +117,23 @@ class SessionWriter:
         for name, values in columns.items():
             if values is not None:
                 cloud[name] = values
+        self.write_cloud(stamp_ns, cloud, receive_ns=receive_ns, frame_id=frame_id, topic=topic)
+
+    def write_cloud(
+        self,
+        stamp_ns: int,
+        cloud: np.ndarray[Any, Any],
+        *,
+        receive_ns: int | None = None,
+        frame_id: str = "lidar",
+        topic: str = topics.LIDAR_POINTS.name,
+    ) -> None:
+        """Rows of a structured array (n,), packed, as a PointCloud2 with the same fields."""
         fields = tuple(
             PointField(name, offset, FIELD_TYPES[dtype.str[1:]])
-            for name, (dtype, offset, *_) in (POINT.fields or {}).items()
+            for name, (dtype, offset, *_) in (cloud.dtype.fields or {}).items()
         )
-        step, header = POINT.itemsize, Header(stamp_ns, frame_id)
+        step, header = cloud.dtype.itemsize, Header(stamp_ns, frame_id)
         message = PointCloud2(header, 1, len(cloud), fields, step, cloud.nbytes, cloud.tobytes())
         self.write(topic, message, stamp_ns, receive_ns)
 
@@ -151,6 +165,36 @@ class SessionWriter:
         self.write(
             topic, CompressedImage(Header(stamp_ns, frame_id), encoding, encoded), stamp_ns, receive_ns
         )
+
+    def write_raw_image(
+        self,
+        stamp_ns: int,
+        data: bytes,
+        model: CameraModel,
+        *,
+        encoding: str,
+        receive_ns: int | None = None,
+        frame_id: str = "cam",
+        topic: str = topics.CAMERA_RAW.name,
+    ) -> None:
+        """A photograph row by row, one byte a pixel; ``encoding`` as ROS names it, for example bayer_rggb8."""
+        header = Header(stamp_ns, frame_id)
+        message = Image(header, model.height, model.width, encoding, model.width, data)
+        self.write(topic, message, stamp_ns, receive_ns)
+
+    def write_exposure(
+        self,
+        stamp_ns: int,
+        exposure_s: float,
+        gain: float,
+        *,
+        receive_ns: int | None = None,
+        frame_id: str = "cam",
+        topic: str = topics.CAMERA_EXPOSURE.name,
+    ) -> None:
+        """How the image of the same stamp was exposed: seconds, and gain (1: none)."""
+        message = CameraExposure(Header(stamp_ns, frame_id), exposure_s, gain)
+        self.write(topic, message, stamp_ns, receive_ns)
 
     def write_camera_info(
         self,

@@ -8,6 +8,7 @@ from pathlib import Path
 from artemis_drivers.virtual import corridor, courtyard, hall, loaded, street
 from artemis_drivers.virtual.world import World
 
+_LEAST_STREET_M = 100.0  # so that even a short walk looks down a street
 MODEL_SUFFIXES = (".glb", ".gltf", ".obj")
 
 #: Builds a world from (seed, length of path in metres that a walk needs at least).
@@ -17,12 +18,16 @@ BuildWorld = Callable[[int, float], World]
 def worlds() -> dict[str, BuildWorld]:
     """All worlds; each is built with ``worlds()[name](seed, length_m)``."""
     return {
-        "street": street.build,
+        "street": _street,
         "courtyard": courtyard.build,
         "hall": hall.build,
         "corridor": corridor.build_corridor,
         "facade": corridor.build_facade,
     }
+
+
+def _street(seed: int, length: float) -> World:
+    return street.build(seed, max(length + 2 * street.END_MARGIN_M, _LEAST_STREET_M))
 
 
 def build_world(name: str, seed: int, length: float) -> World:

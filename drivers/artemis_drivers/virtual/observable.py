@@ -3,7 +3,8 @@
 A point of a surface counts as observed when a beam met the same object within REACH_M of it, the surface
 faces the place that beam came from, and the line from there to the point is free: a beam aimed at it would
 have returned. So the far side of things, what others hide, and what lies between two beams further apart than
-twice the reach are not asked for, whatever the mapping did with the points.
+twice the reach are not asked for, whatever the mapping did with the points. Beams pass panes of glass, so what
+lies behind one can be observed; a pane itself is where a beam met it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8, WorldMesh
 from artemis_drivers.virtual.raycast import first_free_line
 from artemis_drivers.virtual.scene import Scene
+from artemis_drivers.virtual.textures import TextureAtlas
 
 I64 = NDArray[np.int64]
 REACH_M = 0.10
@@ -36,11 +38,13 @@ _EMPTY = np.int64(-1)
 @dataclass(frozen=True, slots=True)
 class ObservedSurface:
     """Points float32 (n, 3) on observed surfaces, their unit ``normals`` (n, 3), ``labels`` uint8 (class) and
-    ``instance`` int32.
+    ``instance`` int32. ``views`` float32 (n, 3) are unit directions to a place from which a beam would have
+    seen the point: one that came to the same object within REACH_M, and whose line to the point is free.
     """
 
     points: F32
     normals: F32
+    views: F32
     labels: U8
     instance: I32
 
@@ -56,7 +60,9 @@ class HitStore:
         self.instance = np.empty(0, np.int32)
 
     def add(self, hit: F64, origin: F64, instance: I32) -> None:
-        """Add beams: noise-free ``hit`` and ``origin`` float64 (n, 3), ``instance`` of the object met."""
+        """Add beams: noise-free ``hit`` and ``origin`` float64 (n, 3), ``instance`` of the object met (of
+        what stands still, as :func:`witnesses` gives it).
+        """
         self._pending.append((hit, origin, instance))
         self._count += len(hit)
         if self._count > max(2_000_000, len(self.hit)):
@@ -78,6 +84,15 @@ class HitStore:
         self._pending, self._count = [], 0
 
 
+def witnesses(mesh: WorldMesh, atlas: TextureAtlas) -> I32:
+    """Per triangle the object that a beam which met it bears witness of, int32 (m,).
+
+    It is the instance; but beams that met the frame of a window say nothing of its pane, which beams pass, so
+    panes have numbers of their own.
+    """
+    return np.where(atlas.arrays.glass[mesh.material], ~mesh.instance, mesh.instance)
+
+
 def observed_surface(mesh: WorldMesh, scene: Scene, store: HitStore, spacing_m: float) -> ObservedSurface:
     """Points ``spacing_m`` apart on those surfaces of ``mesh`` that the beams in ``store`` observed.
 
@@ -91,18 +106,20 @@ def observed_surface(mesh: WorldMesh, scene: Scene, store: HitStore, spacing_m: 
     beams = _beams_index(local[near], store.origin[near] - scene.origin, store.instance[near])
     _, normals = mesh.areas_and_normals()
     parts = _portions(corners, spacing_m)
+    witness = witnesses(mesh, scene.atlas)
     with ThreadPoolExecutor(_WORKERS) as pool:
         pieces = list(
             pool.map(
-                lambda p: _observed_part(corners[p], normals[p], mesh.instance[p], spacing_m, beams, scene),
+                lambda p: _observed_part(corners[p], normals[p], witness[p], spacing_m, beams, scene),
                 parts,
             )
         )
-    points = np.concatenate([points for points, _ in pieces])
-    triangle = np.concatenate([t + part.start for (_, t), part in zip(pieces, parts, strict=True)])
+    points = np.concatenate([points for points, _, _ in pieces])
+    triangle = np.concatenate([t + part.start for (_, _, t), part in zip(pieces, parts, strict=True)])
     return ObservedSurface(
-        (points + scene.origin).astype(np.float32),
+        points,
         normals[triangle].astype(np.float32),
+        np.concatenate([views for _, views, _ in pieces]),
         mesh.class_id[triangle],
         mesh.instance[triangle],
     )
@@ -148,15 +165,18 @@ def _points_at_most(corners: F64, spacing_m: float) -> F64:
 
 def _observed_part(
     corners: F64, normals: F64, instance: I32, spacing_m: float, beams: _Beams, scene: Scene
-) -> tuple[F64, NDArray[np.int64]]:
-    """Observed points of some triangles, in local coordinates, and the triangles they lie on."""
+) -> tuple[F32, F32, I64]:
+    """Observed points of some triangles, directions to where they were seen from, and their triangles."""
     room = int(_points_at_most(corners, spacing_m).sum())
     points, triangle = np.empty((room, 3)), np.empty(room, np.int64)
     tries = np.empty((room, _TRIES), np.int32)
     count = _sample(corners, normals, instance, spacing_m, beams, points, triangle, tries)
     points, triangle, tries = points[:count], triangle[:count], tries[:count]
-    seen = first_free_line(scene.bvh, points, beams.origin, tries, _SLACK_M) >= 0
-    return points[seen], triangle[seen]
+    first = first_free_line(scene.bvh, points, beams.origin, tries, _SLACK_M, scene.panes[0])
+    seen = np.flatnonzero(first >= 0)
+    views = beams.origin[tries[seen, first[seen]]] - points[seen]
+    views /= np.linalg.norm(views, axis=1, keepdims=True)
+    return (points[seen] + scene.origin).astype(np.float32), views.astype(np.float32), triangle[seen]
 
 
 def _pack(cell: I64) -> I64:

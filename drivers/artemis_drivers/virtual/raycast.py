@@ -87,14 +87,23 @@ def cast(bvh: Bvh, origins: F64, directions: F64, max_m: F64 | float = np.inf) -
     return Hits(distance, triangle, u, v)
 
 
-def first_free_line(bvh: Bvh, points: F64, eyes: F64, tries: I32, slack_m: float) -> I32:
+def first_free_line(
+    bvh: Bvh,
+    points: F64,
+    eyes: F64,
+    tries: I32,
+    slack_m: float,
+    passing: NDArray[np.bool_] | None = None,
+) -> I32:
     """Per point the first of its eyes from which nothing blocks the view, -1 when all are blocked.
 
     ``points`` (n, 3) and ``eyes`` (e, 3) are relative to ``bvh.origin``; ``tries`` int32 (n, k) eye numbers,
-    -1 for none. What lies within ``slack_m`` before the point does not block.
+    -1 for none. What lies within ``slack_m`` before the point does not block, nor do the triangles in
+    ``passing`` bool (m,), in the order of ``bvh``.
     """
     out = np.empty(len(points), np.int32)
-    _first_free_line(bvh, points, eyes, tries, slack_m, out)
+    passing = np.zeros(len(bvh.order), bool) if passing is None else passing
+    _first_free_line(bvh, points, eyes, tries, slack_m, passing, out)
     return out
 
 
@@ -299,7 +308,9 @@ def _cast(
 
 
 @njit
-def _first_free_line(bvh: Bvh, points: F64, eyes: F64, tries: I32, slack: float, out: I32) -> None:
+def _first_free_line(
+    bvh: Bvh, points: F64, eyes: F64, tries: I32, slack: float, passing: NDArray[np.bool_], out: I32
+) -> None:
     stack = np.empty(_STACK, np.int32)
     for i in range(len(points)):
         out[i] = -1
@@ -312,14 +323,16 @@ def _first_free_line(bvh: Bvh, points: F64, eyes: F64, tries: I32, slack: float,
             o = (np.float32(eyes[eye, 0]), np.float32(eyes[eye, 1]), np.float32(eyes[eye, 2]))
             d = (np.float32(dx / length), np.float32(dy / length), np.float32(dz / length))
             inv = (inverse(d[0]), inverse(d[1]), inverse(d[2]))
-            if not _blocked(bvh, o, d, inv, np.float32(length - slack), stack):
+            if not _blocked(bvh, passing, o, d, inv, np.float32(length - slack), stack):
                 out[i] = k
                 break
 
 
 @kernel
-def _blocked(bvh: Bvh, o: Vector, d: Vector, inv: Vector, limit: float, stack: I32) -> bool:
-    """Whether any triangle lies nearer than ``limit`` along the ray."""
+def _blocked(
+    bvh: Bvh, passing: NDArray[np.bool_], o: Vector, d: Vector, inv: Vector, limit: float, stack: I32
+) -> bool:
+    """Whether any triangle that is not ``passing`` lies nearer than ``limit`` along the ray."""
     boxes, child, corner = bvh.boxes, bvh.child, bvh.corner
     depth = 1
     stack[0] = 0
@@ -330,7 +343,7 @@ def _blocked(bvh: Bvh, o: Vector, d: Vector, inv: Vector, limit: float, stack: I
             code = ~node
             first = code >> 3
             for k in range(first, first + (code & 7)):
-                if _meet(corner[k], o, d)[0] < limit:
+                if not passing[k] and _meet(corner[k], o, d)[0] < limit:
                     return True
             continue
         box = boxes[node]
