@@ -21,6 +21,7 @@ from artemis_edge.block_store import (
     COUNT,
     EVIDENCE_ONLY,
     FRESH,
+    HITS,
     IX,
     IY,
     IZ,
@@ -42,6 +43,8 @@ from artemis_edge.insertion import InsertRules, insert_points, new_chunk
 
 # A plane may be this much thicker than sigma^2: the noise of the angles adds to that of the range
 THICK = 1.0
+# Points that spread this much more along a plane than across it (variances) tell its direction, if no place on it
+LAYERED = 1.5
 # Fewer hits lie on some plane by chance: three always do
 TRUSTED_COUNT = 6.0
 # A living vertex gives way below this share of the distance that a new one must keep: what a few hits put apart,
@@ -113,7 +116,7 @@ class RefreshSpace(NamedTuple):
     moment: F64  # (216, 16) about the voxel's corner
     total: F64  # (16,)
     eigen: F64  # (6,)
-    wide: F64  # (8,) plane of all 6 x 6 x 6 cells: point, normal, smallest and middle eigenvalue
+    wide: F64  # (9,) plane of all 6 x 6 x 6 cells: point, normal, smallest and middle eigenvalue, noise
 
 
 def refresh_space() -> RefreshSpace:
@@ -126,7 +129,7 @@ def refresh_space() -> RefreshSpace:
         moment=np.zeros((216, 16)),
         total=np.empty(16),
         eigen=np.empty(6),
-        wide=np.empty(8),
+        wide=np.empty(9),
     )
 
 
@@ -199,6 +202,7 @@ def _move_moments(evidence: F32, s: int, code: int, cell_m: float, moment: F64, 
     m[8] = e[SQUARE + 4] + uy * oz + uz * oy + k * oy * oz
     m[9] = e[SQUARE + 5] + 2.0 * uz * oz + k * oz * oz
     m[10], m[11], m[12] = e[VIEW], e[VIEW + 1], e[VIEW + 2]
+    m[13] = e[HITS]
 
 
 @kernel
@@ -245,6 +249,7 @@ def _fit_wide(moment: F64, n: int, total: F64, eigen: F64, wide: F64) -> None:
     wide[0], wide[1], wide[2] = _plane(total, eigen)
     wide[3], wide[4], wide[5] = eigen[0], eigen[1], eigen[2]
     wide[6], wide[7] = max(eigen[3], 0.0), max(eigen[4], 0.0)
+    wide[8] = total[13] / total[0]
 
 
 @kernel
@@ -257,7 +262,8 @@ def _fit_vertex(own: F64, total: F64, wide: F64, plane_sigma_m: float, eigen: F6
     (a crease, a bush) it goes onto the near plane only by the share sigma^2 / lambda_0, because there a plane
     would cut the corner (measured: ungated vertices are worse than raw ones at creases).
     """
-    sigma2 = THICK * plane_sigma_m * plane_sigma_m
+    thick2 = THICK * plane_sigma_m * plane_sigma_m
+    sigma2 = thick2 * total[13] / total[0]  # hits / evidence: the mean of 1 + (range / noise range)^2
     k = 1.0 / own[0]
     mx, my, mz = own[1] * k, own[2] * k, own[3] * k
     gx, gy, gz = _plane(total, eigen)
@@ -266,24 +272,26 @@ def _fit_vertex(own: F64, total: F64, wide: F64, plane_sigma_m: float, eigen: F6
     # a plane: the points spread at least twice as far along it as across it
     flat = l1 > 4.0 * l0 and l1 > 1e-8
     share = 0.0
-    if flat and l0 <= sigma2 and total[0] >= TRUSTED_COUNT:
+    if flat and l0 <= sigma2 and total[13] >= TRUSTED_COUNT:
         share = 1.0
-    elif wide[7] > 4.0 * wide[6] and wide[6] <= 1.5 * max(l0, sigma2):
+    elif wide[7] > 4.0 * wide[6] and wide[6] <= thick2 * wide[8]:
         gx, gy, gz = wide[0], wide[1], wide[2]
         nx, ny, nz = wide[3], wide[4], wide[5]
         share = 1.0
     elif flat:
         share = min(1.0, sigma2 / max(l0, 1e-12))
-    vx, vy, vz = total[10], total[11], total[12]
-    if nx * vx + ny * vy + nz * vz < 0.0:
-        nx, ny, nz = -nx, -ny, -nz
     if share > 0.0:
         d = share * ((mx - gx) * nx + (my - gy) * ny + (mz - gz) * nz)
         mx, my, mz = mx - d * nx, my - d * ny, mz - d * nz
-    else:
-        # no plane: the best known direction is where it was seen from
+    elif l1 <= LAYERED * l0:
+        nx, ny, nz = wide[3], wide[4], wide[5]
+    vx, vy, vz = total[10], total[11], total[12]
+    if share == 0.0 and l1 <= LAYERED * l0 and wide[7] <= LAYERED * wide[6]:
+        # nothing like a plane: the best known direction is where it was seen from
         k = 1.0 / (math.sqrt(vx * vx + vy * vy + vz * vz) + 1e-12)
         nx, ny, nz = vx * k, vy * k, vz * k
+    elif nx * vx + ny * vy + nz * vz < 0.0:
+        nx, ny, nz = -nx, -ny, -nz
     p[POSITION], p[POSITION + 1], p[POSITION + 2] = mx, my, mz
     p[NORMAL], p[NORMAL + 1], p[NORMAL + 2] = nx, ny, nz
     p[ROUGHNESS] = math.sqrt(l0)
