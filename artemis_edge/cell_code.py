@@ -7,8 +7,9 @@ addition without a borrow (the moved coordinates lie in 4..23). Own cells have c
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from artemis_edge._jit import kernel
+from artemis_edge._jit import kernel, trailing_zeros
 from artemis_edge.block_store import Store
 from artemis_edge.frames import I32
 
@@ -42,7 +43,7 @@ def code_cell(code: int) -> int:
 
 @kernel
 def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32) -> int:
-    """Cells with evidence of a voxel (first) and within ``margin`` cells around it.
+    """Cells with evidence of a voxel (first) and within ``margin`` (0..4) cells around it.
 
     Writes ``grid[code] = slot`` and lists the codes; returns how many.
     """
@@ -56,20 +57,29 @@ def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32
 @kernel
 def gather_voxel(store: Store, w: int, k: int, margin: int, grid: I32, code: I32, n: int) -> int:
     """The part of ``gather_cells`` for one of the 27 voxels."""
-    lo, hi = OWN - margin, OWN + 4 + margin
-    bx, by, bz = 8 + (k // 9) * 4, 8 + ((k // 3) % 3) * 4, 8 + (k % 3) * 4
-    mask = store.voxel_mask[w]
-    c = 0
+    first = code_of(8 + (k // 9) * 4, 8 + ((k // 3) % 3) * 4, 8 + (k % 3) * 4)
+    mask = store.voxel_mask[w] & _WITHIN[margin, k]
     while mask != 0:
-        while (mask & np.uint64(1)) == 0:
-            mask >>= np.uint64(1)
-            c += 1
-        X, Y, Z = bx + (c >> 4), by + ((c >> 2) & 3), bz + (c & 3)
-        if lo <= X and hi > X and lo <= Y and hi > Y and lo <= Z and hi > Z:
-            at = code_of(X, Y, Z)
-            grid[at] = store.voxel_cell[w, c]
-            code[n] = at
-            n += 1
-        mask >>= np.uint64(1)
-        c += 1
+        c = trailing_zeros(mask)
+        mask &= mask - np.uint64(1)
+        at = first + ((c >> 4) << 10) + (((c >> 2) & 3) << 5) + (c & 3)
+        grid[at] = store.voxel_cell[w, c]
+        code[n] = at
+        n += 1
     return n
+
+
+def _masks() -> NDArray[np.uint64]:
+    """Cells of each of the 27 voxels that lie within a margin of the own one, uint64 (5 margins, 27)."""
+    c = np.arange(64)
+    cell = np.stack([c >> 4, (c >> 2) & 3, c & 3])
+    out = np.zeros((5, 27), np.uint64)
+    for margin in range(5):
+        for k in range(27):
+            at = cell + 8 + 4 * np.array([[k // 9], [(k // 3) % 3], [k % 3]])
+            inside = ((at >= OWN - margin) & (at < OWN + 4 + margin)).all(axis=0)
+            out[margin, k] = (inside.astype(np.uint64) << c.astype(np.uint64)).sum(dtype=np.uint64)
+    return out
+
+
+_WITHIN = _masks()

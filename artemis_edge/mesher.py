@@ -134,7 +134,7 @@ def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace)
     cells = gather_cells(store, w.neighbour, MARGIN_CELLS, w.grid, w.code)
     n = collect_vertices(store, v, cells, voxel_m, w)
     triangles = plain = 0
-    if n >= 3:
+    if n >= 3 and w.own[0]:  # own cells come first; without own vertices nothing is owned
         edges, ears = take_neighbour_edges(store, w)
         groups = 0
         while groups < MOST_GROUPS and _direction(n, w):

@@ -35,7 +35,7 @@ from artemis_edge.block_store import (
     VIEW,
     Store,
 )
-from artemis_edge.cell_code import CODES, gather_cells
+from artemis_edge.cell_code import CODES, OWN, code_of, gather_cells
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.eigen3 import smallest_eigen3
 from artemis_edge.frames import F32, F64, I32, U8, TrackedFrame
@@ -52,6 +52,9 @@ TRUSTED_COUNT = 6.0
 STAYS = 0.7
 # FRESH of a voxel whose patch must be made anew whatever else it waits for: a vertex it uses is gone
 AT_ONCE = 64
+
+# Bits of a code in which all own cells agree (cell_code.py)
+_FIRST, _NOT_OWN = code_of(OWN, OWN, OWN), ~code_of(3, 3, 3)
 
 
 class VoxelMap:
@@ -140,7 +143,6 @@ def refresh_voxel(store: Store, v: int, stamp: int, rules: RefreshRules, w: Refr
     A cell becomes a vertex when the evidence around it reaches ``least_evidence`` and no living vertex is nearer
     than ``min_distance_m``.
     """
-    state = store.state
     bs.neighbours27(store, v, w.neighbour)
     n = gather_cells(store, w.neighbour, 1, w.grid, w.code)
     for i in range(n):
@@ -148,40 +150,40 @@ def refresh_voxel(store: Store, v: int, stamp: int, rules: RefreshRules, w: Refr
         w.grid[w.code[i]] = i
         _move_moments(store.evidence, w.slot[i], w.code[i], rules.cell_m, w.moment, i)
     _fit_wide(w.moment, n, w.total, w.eigen, w.wide)
-    x0, y0, z0 = (
-        store.voxel[v, IX] * 4 * rules.cell_m,
-        store.voxel[v, IY] * 4 * rules.cell_m,
-        store.voxel[v, IZ] * 4 * rules.cell_m,
-    )
-    for i in range(n):
-        X, Y, Z = (w.code[i] >> 10) - 12, ((w.code[i] >> 5) & 31) - 12, (w.code[i] & 31) - 12
-        if ((X | Y | Z) & ~3) != 0:
-            break  # own cells come first
-        s = w.slot[i]
-        if w.moment[i, 0] == 0.0:  # carved away and not seen again
-            continue
-        if state[s] == CARVED and not is_seen_through(store.evidence[s]):
-            state[s] = EVIDENCE_ONLY
-        _sum_around(w.grid, w.code[i], w.moment, w.total)
-        p = store.vertex[s]
-        _fit_vertex(w.moment[i], w.total, w.wide, rules.plane_sigma_m, w.eigen, p)
-        p[POSITION] += x0
-        p[POSITION + 1] += y0
-        p[POSITION + 2] += z0
-        if state[s] == ALIVE and _is_crowded(
-            store, w.grid, w.slot, w.code[i], s, STAYS * rules.min_distance_m
-        ):
-            state[s] = EVIDENCE_ONLY
-            _tell_neighbours(store, w.neighbour, X, Y, Z, AT_ONCE, stamp)
-        elif (
-            state[s] == EVIDENCE_ONLY
-            and w.total[0] >= rules.least_evidence
-            and _is_apart(store.vertex, state, w.grid, w.slot, w.code[i], s, rules.min_distance_m)
-        ):
-            state[s] = ALIVE
-            _tell_neighbours(store, w.neighbour, X, Y, Z, 1, stamp)
+    if w.total[0] >= rules.least_evidence:  # else no cell can have enough around it
+        for i in range(n):
+            if ((w.code[i] ^ _FIRST) & _NOT_OWN) != 0:
+                break  # own cells come first
+            if w.moment[i, 0] > 0.0:  # else carved away and not seen again
+                _refresh_cell(store, v, i, stamp, rules, w)
     for i in range(n):
         w.grid[w.code[i]] = -1
+
+
+@kernel
+def _refresh_cell(store: Store, v: int, i: int, stamp: int, rules: RefreshRules, w: RefreshSpace) -> None:
+    """Place the vertex of the gathered cell ``i`` of voxel ``v``; let it begin or cease to live."""
+    state, s, code = store.state, w.slot[i], w.code[i]
+    if state[s] == CARVED and not is_seen_through(store.evidence[s]):
+        state[s] = EVIDENCE_ONLY
+    _sum_around(w.grid, code, w.moment, w.total)
+    p = store.vertex[s]
+    _fit_vertex(w.moment[i], w.total, w.wide, rules.plane_sigma_m, w.eigen, p)
+    edge_m = 4 * rules.cell_m
+    p[POSITION] += store.voxel[v, IX] * edge_m
+    p[POSITION + 1] += store.voxel[v, IY] * edge_m
+    p[POSITION + 2] += store.voxel[v, IZ] * edge_m
+    apart = rules.min_distance_m
+    if state[s] == ALIVE and _is_crowded(store, w.grid, w.slot, code, s, STAYS * apart):
+        state[s] = EVIDENCE_ONLY
+        _tell_neighbours(store, w.neighbour, code, AT_ONCE, stamp)
+    elif (
+        state[s] == EVIDENCE_ONLY
+        and w.total[0] >= rules.least_evidence
+        and _is_apart(store.vertex, state, w.grid, w.slot, code, s, apart)
+    ):
+        state[s] = ALIVE
+        _tell_neighbours(store, w.neighbour, code, 1, stamp)
 
 
 @kernel
@@ -298,8 +300,9 @@ def _fit_vertex(own: F64, total: F64, wide: F64, plane_sigma_m: float, eigen: F6
 
 
 @kernel
-def _tell_neighbours(store: Store, neighbour: I32, X: int, Y: int, Z: int, news: int, stamp: int) -> None:
-    """A vertex began or ceased to live in cell X, Y, Z (0..3): voxels that have it in their margin must know."""
+def _tell_neighbours(store: Store, neighbour: I32, code: int, news: int, stamp: int) -> None:
+    """A vertex began or ceased to live in the own cell ``code``: voxels that have it in their margin must know."""
+    X, Y, Z = (code >> 10) & 3, (code >> 5) & 3, code & 3
     for k in range(27):
         u = neighbour[k]
         if k == 13 or u < 0:
