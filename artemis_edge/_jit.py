@@ -90,6 +90,6 @@ def _cpu_has_avx2() -> bool:
 
 _configure()
 
-from artemis_drivers._jit import kernel, njit, trailing_zeros  # noqa: E402  (the cache must be set before numba looks for it)
+from artemis_drivers._jit import kernel, njit  # noqa: E402  (the cache must be set before numba looks for it)
 
-__all__ = ["cache_dir", "kernel", "njit", "sources_hash", "trailing_zeros"]
+__all__ = ["cache_dir", "kernel", "njit", "sources_hash"]

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_edge._jit import kernel, trailing_zeros
-from artemis_edge.block_store import Store
+from artemis_edge._jit import kernel
+from artemis_edge.block_store import Store, lowest_bit
 from artemis_edge.frames import I32
 
 CODES = 1 << 15  # the 16th bit of a stored code is the mesher's
@@ -60,7 +60,7 @@ def gather_voxel(store: Store, w: int, k: int, margin: int, grid: I32, code: I32
     first = code_of(8 + (k // 9) * 4, 8 + ((k // 3) % 3) * 4, 8 + (k % 3) * 4)
     mask = store.voxel_mask[w] & _WITHIN[margin, k]
     while mask != 0:
-        c = trailing_zeros(mask)
+        c = lowest_bit(mask)
         mask &= mask - np.uint64(1)
         at = first + ((c >> 4) << 10) + (((c >> 2) & 3) << 5) + (c & 3)
         grid[at] = store.voxel_cell[w, c]

@@ -10,22 +10,8 @@ array (or a tuple of twenty) is handed on, which measured 5 to 10 times faster f
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numba
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic
 
 njit = partial(numba.njit, cache=True, nogil=True, error_model="numpy")
 kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy", _nrt=False)
-
-
-@intrinsic
-def trailing_zeros(context: Any, mask: Any) -> Any:
-    """Number of zero bits below the lowest one of a uint64 that is not 0: one instruction."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.uint64), generate
