@@ -6,6 +6,8 @@ the whole. Nothing here moves a vertex, and no edge gets a third triangle.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -14,17 +16,19 @@ from artemis_edge._jit import kernel
 from artemis_edge.frames import F32, I32, I64, U8, Bool
 
 LONGEST_LOOP = 12  # edges of a hole that is closed: about as wide as the longest edge that is surface
+ROUNDS = 2  # of closing and trimming; what trimming opens, closing sees
 TRIMS = 6  # rounds of trimming; more find next to nothing (docs/tuning.md)
 _SHIFT = 32
 
 
 def finish(vertices: F32, normals: F32, faces: I32, longest_m: float, smallest_island: int) -> I32:
     """Triangles (t, 3) of the finished mesh over the same ``vertices`` and ``normals`` float32 (n, 3)."""
-    for _ in range(2):
+    for _ in range(ROUNDS):
         faces = close_loops(vertices, normals, faces, longest_m)
-    for _ in range(TRIMS):
-        faces = faces[free_edges(faces).sum(axis=1) < 2]
-    return faces[large_islands(faces, len(vertices), smallest_island)]
+        for _ in range(TRIMS):
+            faces = faces[free_edges(faces).sum(axis=1) < 2]
+    faces = close_loops(vertices, normals, faces, longest_m)
+    return faces[large_islands(faces, smallest_island)]
 
 
 def _half_edges(faces: I32) -> I64:
@@ -81,22 +85,42 @@ def _has(ranked: I64, key: int) -> bool:
 
 
 @kernel
-def _next_edge(start: I64, end: I64, used: U8, vertex: int, home: int) -> int:
-    """Index of the free edge to follow from ``vertex``: one that leads ``home``, else the first unused; -1 none."""
-    chosen = -1
+def _turn_right(vertices: F32, normals: F32, a: int, b: int, c: int) -> float:
+    """Angle 0..2 pi from the direction b-a clockwise to the direction b-c, seen against the normal of b."""
+    p, q, r, g = vertices[a], vertices[b], vertices[c], normals[b]
+    ux, uy, uz = np.float64(p[0] - q[0]), np.float64(p[1] - q[1]), np.float64(p[2] - q[2])
+    wx, wy, wz = np.float64(r[0] - q[0]), np.float64(r[1] - q[1]), np.float64(r[2] - q[2])
+    sine = -((uy * wz - uz * wy) * g[0] + (uz * wx - ux * wz) * g[1] + (ux * wy - uy * wx) * g[2])
+    # the parts across the normal
+    un, wn = ux * g[0] + uy * g[1] + uz * g[2], wx * g[0] + wy * g[1] + wz * g[2]
+    angle = math.atan2(sine, ux * wx + uy * wy + uz * wz - un * wn)
+    return angle if angle > 0.0 else angle + 2.0 * math.pi
+
+
+@kernel
+def _next_edge(
+    vertices: F32, normals: F32, start: I64, end: I64, used: U8, before: int, vertex: int
+) -> int:
+    """Index of the free edge that bounds the same hole after ``before`` - ``vertex``; -1 none.
+
+    Where several pieces of surface touch in a vertex, it is the first one clockwise: a hole lies to the left of
+    its edges.
+    """
+    chosen, least = -1, 7.0
     i = _first(start, vertex)
     while i < start.shape[0] and start[i] == vertex:
         if not used[i]:
-            if end[i] == home:
-                return i
-            if chosen < 0:
-                chosen = i
+            angle = _turn_right(vertices, normals, before, vertex, end[i])
+            if angle < least:
+                chosen, least = i, angle
         i += 1
     return chosen
 
 
 @kernel
-def _walk(start: I64, end: I64, used: U8, seed: int, loop: I64, edge: I64) -> int:
+def _walk(
+    vertices: F32, normals: F32, start: I64, end: I64, used: U8, seed: int, loop: I64, edge: I64
+) -> int:
     """Follow free edges from ``seed``; the loop's length when it closes within ``LONGEST_LOOP`` edges, else 0."""
     home = start[seed]
     loop[0], edge[0] = home, seed
@@ -108,7 +132,7 @@ def _walk(start: I64, end: I64, used: U8, seed: int, loop: I64, edge: I64) -> in
                 return 0
         if n == LONGEST_LOOP:
             return 0
-        step = _next_edge(start, end, used, at, home)
+        step = _next_edge(vertices, normals, start, end, used, loop[n - 1], at)
         if step < 0:
             return 0
         loop[n], edge[n] = at, step
@@ -188,7 +212,7 @@ def fill_loops(
     for seed in range(start.shape[0]):
         if used[seed]:
             continue
-        n = _walk(start, end, used, seed, loop, edge)
+        n = _walk(vertices, normals, start, end, used, seed, loop, edge)
         if n == 0:
             continue
         filled = _clip_ears(vertices, normals, ranked, longest_m, loop, n, fill, count)
@@ -199,14 +223,21 @@ def fill_loops(
     return count
 
 
-def large_islands(faces: I32, vertices: int, least: int) -> Bool:
-    """Which triangles belong to a connected piece of at least ``least`` triangles, bool (t,)."""
+def large_islands(faces: I32, least: int) -> Bool:
+    """Which triangles belong to a piece of at least ``least`` triangles joined by edges, bool (t,).
+
+    A corner in common does not join: such pieces hang in the air as single triangles do.
+    """
     if least <= 1 or len(faces) == 0:
         return np.ones(len(faces), bool)
-    a = np.concatenate((faces[:, 0], faces[:, 1]))
-    b = np.concatenate((faces[:, 1], faces[:, 2]))
-    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(vertices, vertices))
-    piece = connected_components(graph, directed=False)[1][faces[:, 0]]
+    keys = _half_edges(faces).ravel()
+    order = np.argsort(keys, kind="stable")
+    twins = ((keys & 0xFFFFFFFF) << _SHIFT) | (keys >> _SHIFT)
+    at = np.searchsorted(keys[order], twins).clip(0, len(keys) - 1)
+    joined = keys[order[at]] == twins
+    here, there = np.flatnonzero(joined) % len(faces), order[at[joined]] % len(faces)
+    graph = coo_array((np.ones(len(here), bool), (here, there)), shape=(len(faces), len(faces)))
+    piece = connected_components(graph, directed=False)[1]
     keep: Bool = np.bincount(piece)[piece] >= least
     return keep
 
