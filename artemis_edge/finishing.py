@@ -17,7 +17,7 @@ from artemis_edge.frames import F32, I32, I64, U8, Bool
 
 LONGEST_LOOP = 12  # edges of a hole that is closed: about as wide as the longest edge that is surface
 ROUNDS = 2  # of closing and trimming; what trimming opens, closing sees
-TRIMS = 6  # rounds of trimming; more find next to nothing (docs/tuning.md)
+TRIMS = 1  # whiskers a round; more cost thin things more recall than they save open edges (docs/tuning.md)
 _SHIFT = 32
 
 
