@@ -16,8 +16,9 @@ from artemis_edge._jit import kernel
 from artemis_edge.frames import F32, I32, I64, U8, Bool
 
 LONGEST_LOOP = 12  # edges of a hole that is closed: about as wide as the longest edge that is surface
-ROUNDS = 2  # of closing and trimming; what trimming opens, closing sees
-TRIMS = 1  # whiskers a round; more cost thin things more recall than they save open edges (docs/tuning.md)
+# Rounds of closing and trimming: what trimming opens, the next round sees. Trimming whiskers further costs thin
+# things more recall than it saves open edges (docs/tuning.md)
+ROUNDS = 2
 _SHIFT = 32
 
 
@@ -25,8 +26,7 @@ def finish(vertices: F32, normals: F32, faces: I32, longest_m: float, smallest_i
     """Triangles (t, 3) of the finished mesh over the same ``vertices`` and ``normals`` float32 (n, 3)."""
     for _ in range(ROUNDS):
         faces = close_loops(vertices, normals, faces, longest_m)
-        for _ in range(TRIMS):
-            faces = faces[free_edges(faces).sum(axis=1) < 2]
+        faces = faces[free_edges(faces).sum(axis=1) < 2]
     faces = close_loops(vertices, normals, faces, longest_m)
     return faces[large_islands(faces, smallest_island)]
 
