@@ -16,14 +16,20 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.ply import Mesh, bare_mesh, read_mesh, read_points
 from artemis_edge.frames import F32, F64
 from artemis_edge.session import simulate as sim
-from artemis_edge.session import true_views, truth
-from artemis_edge.session.messages import CameraExposure, CompressedImage, Image, Imu, PointCloud2, TFMessage
+from artemis_edge.session import truth
+from artemis_edge.session.messages import CompressedImage, Imu, PointCloud2, TFMessage
 from artemis_edge.session.rig import START_NS
 from artemis_edge.session.truth_files import POINT_TRUTH, POINTS_TOPIC
 from artemis_edge.session.writer import POINT
 from artemis_edge.trajectory import interpolate, read_tum
 
-FAST = {"image_width": "96", "truth_images": "2", "density": "0.5", "reach_m": "60", "reference_spacing_m": "0.05"}
+FAST = {
+    "image_width": "96",
+    "truth_images": "2",
+    "density": "0.5",
+    "reach_m": "60",
+    "reference_spacing_m": "0.05",
+}
 
 
 @pytest.fixture(scope="module")
@@ -230,16 +236,16 @@ def test_winding_counts_flipped_triangles() -> None:
     world, mesh = grid(4, 0.5), grid(20, 0.1, z=0.02)
     for share in (0.0, 0.25, 1.0):
         report = truth.evaluate_against_world(flipped(mesh, share), world)
-        assert report.judged == report.triangles == 800
-        assert report.wound_share == pytest.approx(1 - share)
-        assert report.wound_area_share == pytest.approx(1 - share, abs=1e-3)
+        assert report.winding["nearest"].judged == report.triangles == 800
+        assert report.winding["nearest"].share == pytest.approx(1 - share)
+        assert report.winding["nearest"].area_share == pytest.approx(1 - share, abs=1e-3)
         assert report.area_m2 == pytest.approx(4.0, rel=1e-4)
 
 
 def test_only_triangles_near_a_surface_are_judged() -> None:
     report = truth.evaluate_against_world(grid(20, 0.1, z=0.3), grid(4, 0.5))
-    assert report.judged == 0
-    assert np.isnan(report.wound_share)
+    assert report.winding["nearest"].judged == 0
+    assert np.isnan(report.winding["nearest"].share)
     assert report.bridging_area_share == 1.0  # all of it hangs 0.3 m in the air
 
 
@@ -250,7 +256,10 @@ def test_observed_surfaces_judge_the_winding() -> None:
     points: F32 = np.random.default_rng(0).uniform(0, 2, (20_000, 3)).astype(np.float32)
     points[:, 2] = 0
     normals = np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
-    assert truth.evaluate_against_world(mesh, world, (points, normals)).wound_share == 1.0
+    assert truth.evaluate_against_world(mesh, world, truth.Reference(points, normals)).winding == {
+        "nearest": truth.Winding(1.0, pytest.approx(1.0), 800),
+        "mean": truth.Winding(1.0, pytest.approx(1.0), 800),
+    }
 
 
 def bridged(gap: float, spacing: float) -> tuple[Mesh, Mesh]:
@@ -275,7 +284,7 @@ def test_a_strip_across_a_wide_gap_is_bridging() -> None:
     # at the rims the median edge lies between 0.1 m and the diagonals' 0.14 m: what is further than 0.15 to
     # 0.21 m from both rims hangs
     assert 0.58 * 2.0 / whole < report.bridging_area_share < 0.70 * 2.0 / whole
-    assert report.wound_share > 0.99
+    assert report.winding["nearest"].share > 0.99
 
 
 def test_a_strip_across_a_narrow_gap_is_not() -> None:
@@ -307,7 +316,9 @@ def test_world_judges_itself_as_right(session: Path) -> None:
         truth.read_reference(session / "truth" / "reference.ply"),
     )
     assert report.bridging_area_share < 1e-3
-    assert report.wound_area_share > 0.9  # thin things have their hidden sides beside the observed ones
+    assert (
+        report.winding["nearest"].area_share > 0.9
+    )  # thin things have their hidden sides beside the observed ones
 
 
 def test_a_foreign_reference_is_refused(tmp_path: Path) -> None:

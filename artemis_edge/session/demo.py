@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from artemis_edge.trajectory import inverse, read_tum
 
 SESSION = "session"
 # Measuring within 10 cm thins the reference to 5 cm anyway.
-_SETTINGS = {"reference_spacing_m": "0.04"}
+_SETTINGS = {"reference_spacing_m": "0.04", "image_width": "640"}
 # How far an Avia's points lie close enough together to carry a mesh at the default spacing.
 NEAR_M = 30.0
 
@@ -49,17 +49,17 @@ def measure(mesh: Mesh, trajectory: Trajectory, truth: Path) -> Evaluation:
     The levelling error of the first pose is measured apart, because it would tilt the whole map.
     """
     true_path = read_tum(truth / "trajectory.tum")
-    points, normals = read_reference(truth / "reference.ply")
+    reference = read_reference(truth / "reference.ply")
     T_truth_world = true_path.T_world_lidar[0] @ inverse(trajectory.T_world_lidar[0])
     moved = replace(mesh, vertices=_moved(mesh.vertices, T_truth_world))
-    world = evaluate_against_world(moved, read_mesh(truth / "mesh.ply"), (points, normals))
-    scores = evaluate_mesh(moved, points, crop=True)
+    world = evaluate_against_world(moved, read_mesh(truth / "mesh.ply"), reference)
+    scores = evaluate_mesh(moved, reference.points, crop=True)
     near = near_path(scores.comparisons[0], true_path.T_world_lidar[:, :3, 3], NEAR_M)
     return Evaluation(
         mesh=scores,
         trajectory=evaluate_trajectory(trajectory, true_path),
         world={
-            **asdict(world),
+            **world.to_json(),
             "levelling_error_deg": _angle_deg(T_truth_world),
             "near_m": NEAR_M,
             "near_precision": near.precision,
@@ -113,7 +113,12 @@ def _measured(found: dict[str, Any], length_m: float) -> list[tuple[str, str]]:
             "mesh within 10 cm",
             f"F1 {world['near_f1']:.3f} up to {NEAR_M:g} m from the path ({near}); {scores['f1']:.3f} of all",
         ),
-        ("wound as the world", f"{_percent(world['wound_share'])} of the triangles"),
+        (
+            "wound as the world",
+            f"{_percent(world['mean_wound_share'])} of the triangles by the mean normal around them, "
+            f"{_percent(world['facing_wound_share'])} by where they were seen from, "
+            f"{_percent(world['wound_share'])} by the nearest normal",
+        ),
         ("bridging a gap", f"{_percent(world['bridging_area_share'])} of the area"),
         ("edges", f"{edges['non_manifold_share']:.2%} non-manifold, {edges['boundary_share']:.2%} boundary"),
         (

@@ -1,28 +1,31 @@
 """A reconstructed mesh against the truth of a virtual world: its winding, and what of it bridges air.
 
-Definitions. *Winding*: among triangles whose centroid lies within NEAR_M of an observed surface, the share
-whose normal (right-hand rule) agrees (dot > 0) with that surface's normal at its nearest point; in a virtual
-world normals point out of the solids, that is, towards any sensor that can see them. *Bridging*: a point of
-a triangle hangs in air when it is further from every surface of the world than BRIDGE times the local
-spacing, which is the median length of the edges that touch the triangle's corners (its one-ring). A gap of
-width g has its middle g/2 from both rims, so BRIDGE = 1.5 finds what spans a gap wider than three spacings.
-A spacing finer than SPACING_FLOOR_M counts as that, so that sensor noise does not count as a bridge.
+*Winding*: of the triangles whose centroid lies within NEAR_M of an observed surface, the share wound as it is;
+``winding.py`` defines three judges. In a virtual world normals point out of the solids, that is, towards any sensor
+that can see them. *Bridging*: a point of a triangle hangs in air when it is further from every surface of the world
+than BRIDGE times the local spacing, which is the median length of the edges that touch the triangle's corners (its
+one-ring). A gap of width g has its middle g/2 from both rims, so BRIDGE = 1.5 finds what spans a gap wider than
+three spacings. A spacing finer than SPACING_FLOOR_M counts as that, so that sensor noise does not count as a bridge.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from artemis_drivers.virtual.proximity import anything_within
+from artemis_drivers.virtual.raycast import build_bvh
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from artemis_edge.errors import InputError
 from artemis_edge.export.ply import Mesh, read_mesh
-from artemis_edge.frames import F32, F64
+from artemis_edge.frames import F32, F64, I32, U8, Bool
+from artemis_edge.session.truth_files import REFERENCE_POINT
+from artemis_edge.session.winding import NEAR_M, Verdict, near, verdicts
 
-NEAR_M = 0.10
+__all__ = ["BRIDGE", "NEAR_M", "Reference", "TruthReport", "Winding", "evaluate_against_world"]
+
 BRIDGE = 1.5
 SPACING_FLOOR_M = 0.05
 _SURFACE_SPACING_M = 0.04  # of the samples on the world that stand for its surfaces
@@ -32,44 +35,79 @@ _SEED = 7
 
 
 @dataclass(frozen=True, slots=True)
-class TruthReport:
-    """Shares 0..1 (NaN when nothing can be judged); areas in m2.
+class Reference:
+    """The observed surface: ``points``, unit ``normals`` and ``views`` (towards a place from which a beam saw the
+    point) float32 (n, 3), ``labels`` uint8, ``instance`` int32 (n,), and the names of the classes.
 
-    ``wound_share`` and ``wound_area_share``: of the judged triangles, by number and by area, those wound as
-    the world is; ``judged`` their number, ``triangles`` all. ``bridging_area_share``: of the whole area
-    ``area_m2``, what hangs in air.
+    Without ``views``, nothing is said of facing; without ``labels``, nothing of classes.
     """
 
-    wound_share: float
-    wound_area_share: float
-    bridging_area_share: float
+    points: F32
+    normals: F32
+    views: F32 | None = None
+    labels: U8 | None = None
+    instance: I32 | None = None
+    label_names: dict[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Winding:
+    """Shares 0..1 by number and by area of the ``judged`` triangles that agree; NaN when none is judged."""
+
+    share: float
+    area_share: float
     judged: int
+
+
+@dataclass(frozen=True, slots=True)
+class TruthReport:
+    """``winding`` by judge (nearest, mean, facing), ``classes`` the same by the class of the nearest observed
+    point; ``bridging_area_share``: of the whole area ``area_m2``, what hangs in air.
+    """
+
+    winding: dict[str, Winding]
+    classes: dict[str, dict[str, Winding]]
+    bridging_area_share: float
     triangles: int
     area_m2: float
 
+    def to_json(self) -> dict[str, float]:
+        """Plain values; the judge ``nearest`` is called wound, as ever."""
+        out: dict[str, float] = {}
+        for prefix, judge in (("", "nearest"), ("mean_", "mean"), ("facing_", "facing")):
+            if judge in self.winding:
+                found = self.winding[judge]
+                out[f"{prefix}wound_share"] = found.share
+                out[f"{prefix}wound_area_share"] = found.area_share
+                out[f"{prefix}judged"] = found.judged
+        return out | {
+            "bridging_area_share": self.bridging_area_share,
+            "triangles": self.triangles,
+            "area_m2": self.area_m2,
+        }
 
-def evaluate_against_world(mesh: Mesh, world: Mesh, observed: tuple[F32, F32] | None = None) -> TruthReport:
+
+def evaluate_against_world(mesh: Mesh, world: Mesh, observed: Reference | None = None) -> TruthReport:
     """Judge ``mesh`` by the world mesh, both in the same frame.
 
-    ``observed`` are points and normals float32 (n, 3) of the observed surface (truth/reference.ply): they
-    judge the winding, because inside walls and under cars surfaces touch that no sensor can tell apart.
-    Without them all of the world's surfaces do. Raises InputError when either mesh has no triangles.
+    ``observed`` (truth/reference.ply) judges the winding, because inside walls and under cars surfaces touch
+    that no sensor can tell apart. Without it all of the world's surfaces do. Raises InputError when either mesh
+    has no triangles.
     """
     if len(mesh.faces) == 0 or len(world.faces) == 0:
         raise InputError("a mesh without triangles cannot be compared with a world; give a mesh with faces")
     corners = mesh.vertices[mesh.faces].astype(np.float64)
-    low, high = corners.min(axis=(0, 1)) - _MARGIN_M, corners.max(axis=(0, 1)) + _MARGIN_M
     area, normal = _area_and_normal(corners)
-    surface, surface_normal = _world_samples(world, low, high)
-    judge = (surface, surface_normal) if observed is None else observed
-    wound, judged = _winding(corners.mean(axis=1), normal, *judge)
+    surface = _within(world, corners)
+    judge = _world_samples(surface) if observed is None else observed
+    found = near(corners.mean(axis=1), judge.points, judge.normals)
+    said = verdicts(normal, found, judge.normals, judge.views)
+    class_of = None if judge.labels is None else judge.labels[np.maximum(found.nearest, 0)]
     bridged = _bridged_area(corners, area, _local_spacing(mesh), surface)
-    agree = judged & wound
     return TruthReport(
-        wound_share=_share(agree.sum(), judged.sum()),
-        wound_area_share=_share(area[agree].sum(), area[judged].sum()),
+        winding={name: _winding(verdict, area) for name, verdict in said.items()},
+        classes={} if class_of is None else _by_class(said, area, class_of, judge.label_names),
         bridging_area_share=_share(bridged.sum(), area.sum()),
-        judged=int(judged.sum()),
         triangles=len(corners),
         area_m2=float(area.sum()),
     )
@@ -82,16 +120,48 @@ def evaluate_files(mesh: Path, truth: Path) -> TruthReport:
     return evaluate_against_world(read_mesh(mesh), read_mesh(truth / "mesh.ply"), observed)
 
 
-def read_reference(path: Path) -> tuple[F32, F32]:
-    """Points and normals float32 (n, 3) of a reference.ply that ``simulate`` wrote."""
-    content = path.read_bytes()
+def read_reference(path: Path) -> Reference:
+    """A reference.ply that ``simulate`` wrote; InputError for any other file."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; simulate the session again") from None
     end = content.find(b"end_header\n") + len(b"end_header\n")
     header = content[:end].decode("ascii", errors="replace")
-    row = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("label", "u1")])
-    if "property float nz\nproperty uchar label" not in header or (len(content) - end) % row.itemsize:
+    names = [line.split()[-1] for line in header.splitlines() if line.startswith("property")]
+    wanted = ["x", "y", "z", "nx", "ny", "nz", "vx", "vy", "vz", "label", "instance"]
+    if names != wanted or (len(content) - end) % REFERENCE_POINT.itemsize:
         raise InputError(f"{path} is not a reference written by 'artemis-edge simulate'; simulate it again")
-    rows = np.frombuffer(content, row, offset=end)
-    return rows["position"].copy(), rows["normal"].copy()
+    rows = np.frombuffer(content, REFERENCE_POINT, offset=end)
+    words = [line.split(maxsplit=3) for line in header.splitlines() if line.startswith("comment label ")]
+    return Reference(
+        rows["position"].copy(),
+        rows["normal"].copy(),
+        rows["view"].copy(),
+        rows["label"].copy(),
+        rows["instance"].copy(),
+        {int(number): name for _, _, number, name in words},
+    )
+
+
+def _winding(verdict: Verdict, area: F64, chosen: Bool | None = None) -> Winding:
+    judged = verdict.judged if chosen is None else verdict.judged & chosen
+    agrees = verdict.agrees & judged
+    return Winding(
+        _share(agrees.sum(), judged.sum()),
+        _share(area[agrees].sum(), area[judged].sum()),
+        int(judged.sum()),
+    )
+
+
+def _by_class(
+    said: dict[str, Verdict], area: F64, class_of: U8, names: dict[int, str]
+) -> dict[str, dict[str, Winding]]:
+    out = {}
+    for label in np.unique(class_of[said["nearest"].judged]):
+        name = names.get(int(label), "background")
+        out[name] = {judge: _winding(verdict, area, class_of == label) for judge, verdict in said.items()}
+    return out
 
 
 def _share(part: float, whole: float) -> float:
@@ -104,27 +174,16 @@ def _area_and_normal(corners: F64) -> tuple[F64, F64]:
     return twice / 2, cross / np.maximum(twice, 1e-30)[:, None]
 
 
-def _winding(
-    centroid: F64, normal: F64, surface: F32, surface_normal: F32
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Per triangle: wound as the nearest surface, and whether one is near enough to judge."""
-    distance, nearest = cKDTree(surface).query(centroid, distance_upper_bound=NEAR_M, workers=-1)
-    judged = np.isfinite(distance) & (np.abs(normal).sum(axis=1) > 0)
-    agree = np.zeros(len(centroid), bool)
-    agree[judged] = (normal[judged] * surface_normal[nearest[judged]]).sum(axis=1) > 0
-    return agree, judged
-
-
 def _local_spacing(mesh: Mesh) -> F64:
     """Per triangle the median length of all edges that touch one of its corners, floored."""
     faces = mesh.faces.astype(np.int64)
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = np.unique(edges, axis=0)
+    edges = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1])
+    edges = np.stack([edges // len(mesh.vertices), edges % len(mesh.vertices)], axis=1)
     length = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1).astype(
         np.float64
     )
-    vertex = edges.reshape(-1)
-    per_vertex = _grouped_median(vertex, np.repeat(length, 2), len(mesh.vertices))
+    per_vertex = _grouped_median(edges.reshape(-1), np.repeat(length, 2), len(mesh.vertices))
     # the median of the corners' medians: their rings share most edges with the triangle's own ring
     spacing = np.median(per_vertex[faces], axis=1)
     return np.maximum(spacing, SPACING_FLOOR_M)
@@ -143,14 +202,11 @@ def _grouped_median(group: NDArray[np.int64], value: F64, groups: int) -> F64:
     return out
 
 
-def _bridged_area(corners: F64, area: F64, spacing: F64, surface: F32) -> F64:
+def _bridged_area(corners: F64, area: F64, spacing: F64, surface: F64) -> F64:
     """Per triangle the area that hangs in air: its area times the share of its samples that do."""
-    tree = cKDTree(surface)
     points, triangle = _samples(corners, area, _MESH_SPACING_M, np.random.default_rng(_SEED))
-    limit = BRIDGE * spacing[triangle]
-    distance, _ = tree.query(points, distance_upper_bound=float(limit.max()) + 1e-6, workers=-1)
-    # the samples of the world stand for surfaces: up to half their diagonal lies between them
-    hanging = distance > np.hypot(limit, _SURFACE_SPACING_M * 0.71)
+    bvh = build_bvh(surface.astype(np.float32))
+    hanging = ~anything_within(bvh, points, BRIDGE * spacing[triangle])
     taken = np.bincount(triangle, minlength=len(corners))
     hung = np.bincount(triangle, hanging.astype(np.float64), minlength=len(corners))
     return np.asarray(area * hung / np.maximum(taken, 1))
@@ -169,12 +225,17 @@ def _samples(
     return a + u[:, None] * (b - a) + v[:, None] * (c - a), triangle
 
 
-def _world_samples(world: Mesh, low: F64, high: F64) -> tuple[F32, F32]:
-    """Points and normals on the world's surfaces within the box."""
-    corners = world.vertices[world.faces].astype(np.float64)
-    inside = ((corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)).all(axis=1)
-    corners = corners[inside]
-    area, normal = _area_and_normal(corners)
-    points, triangle = _samples(corners, area, _SURFACE_SPACING_M, np.random.default_rng(_SEED))
-    kept = ((points >= low) & (points <= high)).all(axis=1)
-    return points[kept].astype(np.float32), normal[triangle[kept]].astype(np.float32)
+def _within(world: Mesh, corners: F64) -> F64:
+    """Corners (m, 3, 3) of the world's triangles around a reconstruction."""
+    low, high = corners.min(axis=(0, 1)) - _MARGIN_M, corners.max(axis=(0, 1)) + _MARGIN_M
+    surface = world.vertices[world.faces].astype(np.float64)
+    inside = ((surface.max(axis=1) >= low) & (surface.min(axis=1) <= high)).all(axis=1)
+    kept: F64 = surface[inside]
+    return kept
+
+
+def _world_samples(surface: F64) -> Reference:
+    """Points and normals on the world's surfaces, as if all had been observed."""
+    area, normal = _area_and_normal(surface)
+    points, triangle = _samples(surface, area, _SURFACE_SPACING_M, np.random.default_rng(_SEED))
+    return Reference(points.astype(np.float32), normal[triangle].astype(np.float32))

@@ -1,0 +1,141 @@
+"""The mapping with true poses on every virtual world: how near to what could be observed, class by class.
+
+    .venv/bin/python tests/bench/worlds.py [--worlds street hall] [--seed 1] [--seconds 20] [--json FILE]
+
+Each world is simulated and mapped (``reprocess --poses truth/trajectory_400hz.tum``) into a temporary folder, or into
+``--out``. F1 at 5 and 10 cm against the observed surface, recall weighted by nothing: classes of which less than
+LEAST_POINTS was observed are left out of the table, not of the JSON. Mesh on things that moved is left out of the
+precision of ``all`` and of the classes, and counted beside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from artemis_drivers.virtual.catalogue import worlds
+
+from artemis_edge.config import load
+from artemis_edge.evaluate.by_class import Score, score_classes
+from artemis_edge.export.ply import read_mesh, read_points
+from artemis_edge.progress import progress, say
+from artemis_edge.runtime import Request, reprocess
+from artemis_edge.session.simulate import simulate
+from artemis_edge.session.truth import Winding, evaluate_against_world, read_reference
+
+TAUS_M = (0.05, 0.1)
+LEAST_POINTS = 1000
+JUDGES = ("nearest", "mean", "facing")
+
+
+def measure(world: str, seed: int, seconds: float, lidar: str, out: Path, sets: list[str]) -> dict[str, Any]:
+    """Simulate, map and measure one world."""
+    session = out / "session"
+    with progress(f"recording {world}") as report:
+        made = simulate(world, seed, seconds, lidar, session, {"camera": "off"}, report)
+    request = Request(session, out, load(sets=sets), poses=made.truth / "trajectory_400hz.tum")
+    with progress(f"mapping {world}") as report:
+        outcome = reprocess(request, report)
+    mesh = read_mesh(out / "mesh.ply")
+    reference = read_reference(made.truth / "reference.ply")
+    moving = read_points(made.truth / "moving.ply").points
+    assert reference.labels is not None
+    names = {0: "background", **reference.label_names}
+    truth = evaluate_against_world(mesh, read_mesh(made.truth / "mesh.ply"), reference)
+    scores = {
+        f"{tau:g}": score_classes(mesh, reference.points, reference.labels, names, tau, moving)
+        for tau in TAUS_M
+    }
+    classes = {name: {j: _winding(w) for j, w in found.items()} for name, found in truth.classes.items()}
+    return {
+        "world": world,
+        "seed": seed,
+        "lidar": lidar,
+        "length_m": made.length_m,
+        "reference_points": made.reference_points,
+        "moving_points": made.moving_points,
+        "triangles": truth.triangles,
+        "area_m2": truth.area_m2,
+        "frame_ms": outcome.report["frame_ms"],
+        "f1": {tau: {name: s.to_json() for name, s in found.items()} for tau, found in scores.items()},
+        "winding": {judge: _winding(w) for judge, w in truth.winding.items()},
+        "winding_by_class": classes,
+        "bridging_area_share": truth.bridging_area_share,
+        "table": table(world, scores, truth.winding, truth.classes, truth.bridging_area_share),
+    }
+
+
+def _winding(found: Winding) -> dict[str, float | int | None]:
+    shares = {"share": found.share, "area_share": found.area_share}
+    plain: dict[str, float | int | None] = {k: v if v == v else None for k, v in shares.items()}
+    return plain | {"judged": found.judged}
+
+
+def table(
+    world: str,
+    scores: dict[str, dict[str, Score]],
+    winding: dict[str, Winding],
+    classes: dict[str, dict[str, Winding]],
+    bridging: float,
+) -> str:
+    """Rows of a Markdown table: the world, then its classes, those with the most points first."""
+    fine, coarse = (scores[f"{tau:g}"] for tau in TAUS_M)
+    shown = sorted(fine, key=lambda name: -fine[name].points)
+    rows = []
+    for name in shown:
+        if fine[name].points < LEAST_POINTS:
+            continue
+        judged = winding if name == "all" else classes.get(name, {})
+        wound = " | ".join(_percent(judged[j].share) if j in judged else "-" for j in JUDGES)
+        rows.append(
+            f"| {world} | {name} | {_score(fine[name])} | {_score(coarse[name])} | {wound} | "
+            f"{_percent(bridging) if name == 'all' else ''} | {fine[name].points} |"
+        )
+    return "\n".join(rows)
+
+
+HEADER = (
+    "| world | class | F1 5 cm (P, R) | F1 10 cm (P, R) | wound, nearest | wound, mean | facing | bridging | "
+    "points |\n|---|---|---|---|---|---|---|---|---|"
+)
+
+
+def _score(score: Score) -> str:
+    return f"**{score.f1:.3f}** ({score.precision:.3f}, {score.recall:.3f})"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2f} %" if share == share else "-"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--worlds", nargs="+", default=list(worlds()), metavar="WORLD")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--lidar", default="avia")
+    parser.add_argument("--set", action="append", default=[], dest="sets", help="setting of the mapping")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="keep sessions and meshes here")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    given = parser.parse_args()
+    found = []
+    with tempfile.TemporaryDirectory(prefix="artemis-worlds-") as scratch:
+        for world in given.worlds:
+            out = (given.out or Path(scratch)) / Path(world).stem
+            out.mkdir(parents=True, exist_ok=True)
+            found.append(measure(world, given.seed, given.seconds, given.lidar, out, given.sets))
+            say(found[-1]["table"])
+    print(HEADER)
+    for row in found:
+        print(row.pop("table"))
+    if given.json is not None:
+        given.json.write_text(json.dumps(found, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
