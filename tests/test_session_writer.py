@@ -50,6 +50,7 @@ def _write(path: Path, frames: int = 3) -> Path:
             )
             out.write_imu(stamp, np.array([0.1, 0.2, 0.3]), np.array([0.0, 0.0, 9.81]))
             out.write_image(stamp, b"\xff\xd8 not really a jpeg")
+            out.write_exposure(stamp, 0.004, 2.0 + k)
             out.write_tf(stamp, "map", "lidar", T)
             out.write_odometry(stamp, T, linear=np.array([1.0, 0.0, 0.0]))
     return path
@@ -70,6 +71,7 @@ def test_rosbags_reads_equal_values(tmp_path: Path) -> None:
         "/lidar/points": 3,
         "/imu": 3,
         "/camera/image/compressed": 3,
+        "/camera/exposure": 3,
         "/tf": 3,
         "/odom": 3,
     }
@@ -96,13 +98,25 @@ def test_rosbags_reads_equal_values(tmp_path: Path) -> None:
     assert (transform.transform.translation.z, transform.transform.rotation.w) == (3.0, pytest.approx(0.8))
     assert seen["/odom"][0][1].twist.twist.linear.x == 1.0
     assert seen["/imu"][0][1].linear_acceleration.z == 9.81
+    assert (seen["/camera/exposure"][1][1].exposure_s, seen["/camera/exposure"][1][1].gain) == (0.004, 3.0)
+
+
+def test_a_mosaic_is_an_image_that_others_read(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    model = CameraModel(4, 3, 5.0, 5.0, 2.0, 1.0)
+    with SessionWriter(path) as out:
+        out.write_raw_image(5, bytes(range(12)), model, encoding="bayer_rggb8")
+    with AnyReader([path]) as reader:
+        (image,) = (reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages())
+    assert (image.width, image.height, image.step, image.encoding) == (4, 3, 4, "bayer_rggb8")
+    assert image.data.tolist() == list(range(12))
 
 
 def test_mcap_ros2_reads_it(tmp_path: Path) -> None:
     path = _write(tmp_path / "s.mcap")
     with path.open("rb") as stream:
         decoded = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
-    assert len(decoded) == 17
+    assert len(decoded) == 20
     clouds = [item for item in decoded if item[1].topic == "/lidar/points"]
     assert [item[2].log_time - item[2].publish_time for item in clouds] == [5, 5, 5]
     assert [item[2].sequence for item in clouds] == [0, 1, 2]
