@@ -2,6 +2,7 @@
 
 import json
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -160,6 +161,15 @@ def test_map_from_above_shows_colours_where_they_are() -> None:
     labelled = pictures.map_from_above(shown, "label")
     assert np.ptp(labelled[height // 4, width // 4].astype(int)) < 16  # background is grey
     assert np.ptp(labelled[height // 4, 3 * width // 4].astype(int)) > 60
+
+
+@pytest.mark.parametrize("kind", ["texture", "label", "confidence", "height"])
+def test_a_long_corridor_has_a_picture(kind: pictures.Kind) -> None:
+    hills = hilly()
+    long = replace(hills, vertices=hills.vertices * np.array([100.0, 0.5, 1.0], np.float32))
+    shown = pictures.scene(long, Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4))))
+    height, width = pictures.map_from_above(shown, kind).shape[:2]
+    assert width == pytest.approx(1200, abs=2) and height > 200
 
 
 @pytest.mark.parametrize("kind", ["texture", "label", "confidence", "height"])

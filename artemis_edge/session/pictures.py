@@ -26,6 +26,7 @@ _TRIM_PERCENT = 0.2
 _HEIGHT_TRIM_PERCENT = 2.0
 _MARGIN = 0.03
 _SMALLEST_M = 1.0
+_NARROWEST = 0.25  # a corridor's picture has room for legend and scale
 _LIGHT = np.array([-0.35, 0.45, 0.82])
 _AMBIENT = 0.45
 _EDGE_STRENGTH = 12.0
@@ -57,7 +58,8 @@ def scene(mesh: Mesh, trajectory: Trajectory) -> Scene:
     if len(corners) == 0:
         corners = np.zeros((1, 3))
     low, high = corners.min(axis=0), corners.max(axis=0)
-    grow = np.maximum((high - low) * _MARGIN, 0.5 * (_SMALLEST_M - (high - low)))
+    least = np.array([*[max(_SMALLEST_M, _NARROWEST * float(np.max((high - low)[:2])))] * 2, _SMALLEST_M])
+    grow = np.maximum((high - low) * _MARGIN, 0.5 * (least - (high - low)))
     return Scene(mesh, vertices, mesh.normals @ R.T.astype(np.float32), path, low - grow, high + grow)
 
 
