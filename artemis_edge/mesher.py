@@ -569,25 +569,24 @@ def _choose(
 
 
 @kernel
-def mesh_batch(
-    store: Store,
-    batch: I32,
-    stamp: int,
-    voxel_m: float,
-    refresh_rules: RefreshRules,
-    refresh: RefreshSpace,
-    rules: Rules,
-    w: Workspace,
-) -> int:
-    """Refresh the vertices of all voxels of the batch, then replace their patches; returns patches refused."""
+def refresh_batch(store: Store, batch: I32, stamp: int, rules: RefreshRules, w: RefreshSpace) -> None:
+    """Refresh the vertices of all voxels of the batch."""
     for v in batch:
-        refresh_voxel(store, v, stamp, refresh_rules, refresh)
+        refresh_voxel(store, v, stamp, rules, w)
+
+
+@kernel
+def mesh_batch(store: Store, batch: I32, stamp: int, voxel_m: float, rules: Rules, w: Workspace) -> int:
+    """Replace the patches of all voxels of the batch; returns patches refused.
+
+    What the batch's voxels told each other while they were refreshed is in their patches then.
+    """
     refused = 0
     for v in batch:
         row = store.voxel[v]
         row[AT_MESH] += max(row[PENDING], 1)
         row[PENDING] = 0
-        row[FRESH] = 0  # what the batch's other voxels told it while they were refreshed is in its patch now
+        row[FRESH] = 0
         if not mesh_voxel(store, v, voxel_m, rules, w):
             refused += 1
             row[FRESH] = AT_ONCE
@@ -632,37 +631,45 @@ class Mesher:
         """Mesh what is due after the voxels ``active`` received points in frame ``stamp``."""
         enqueue_all(self._map.store, active, stamp)
         n = choose_batch(self._map.store, stamp, self._schedule, False, self._batch)
-        self._mesh(self._batch[:n], stamp)
+        batch = self._by_block(self._batch[:n])
+        self._make_ready(self._blocks(batch), stamp)
+        self._refresh(batch, stamp)
+        self._mesh(batch, stamp)
 
     def flush(self, stamp: int) -> None:
-        """Mesh everything that was postponed. Meshing can promote neighbours, hence until nothing is left."""
+        """Mesh everything that was postponed. Meshing can promote neighbours, hence until nothing is left.
+
+        All vertices are refreshed before the first patch is made, or most patches would be made twice.
+        """
         for _ in range(FLUSHES):
             batch = np.empty(self.waiting, np.int32)
-            n = choose_batch(self._map.store, stamp, self._schedule, True, batch)
-            if n == 0:
+            batch = self._by_block(batch[: choose_batch(self._map.store, stamp, self._schedule, True, batch)])
+            if len(batch) == 0:
                 return
-            for first in range(0, n, FLUSH_PART):
-                self._mesh(batch[first : min(first + FLUSH_PART, n)], stamp)
+            parts = [batch[first : first + FLUSH_PART] for first in range(0, len(batch), FLUSH_PART)]
+            for stage in (self._refresh, self._mesh):
+                for part in parts:
+                    self._make_ready(self._blocks(part), stamp)
+                    stage(part, stamp)
 
     @property
     def waiting(self) -> int:
         """Voxels in the queue."""
         return int(self._map.store.counter[QUEUE_LEN])
 
+    def _blocks(self, batch: I32) -> I32:
+        return np.unique(self._map.store.voxel[batch, BLOCK])
+
+    def _by_block(self, batch: I32) -> I32:
+        """Block by block: voxels of a block share cells and neighbours, which are then in the cache."""
+        return batch[np.argsort(self._map.store.voxel[batch, BLOCK], kind="stable")]
+
+    def _refresh(self, batch: I32, stamp: int) -> None:
+        refresh_batch(self._map.store, batch, stamp, self._refresh_rules, self._refresh_space)
+
     def _mesh(self, batch: I32, stamp: int) -> None:
-        self._make_ready(np.unique(self._map.store.voxel[batch, BLOCK]), stamp)
-        # block by block: voxels of a block share cells and neighbours, which are then in the cache
-        batch = batch[np.argsort(self._map.store.voxel[batch, BLOCK], kind="stable")]
-        self.refused += mesh_batch(
-            self._map.store,
-            batch,
-            stamp,
-            self._map.config.voxel_m,
-            self._refresh_rules,
-            self._refresh_space,
-            self._rules,
-            self._workspace,
-        )
+        voxel_m = self._map.config.voxel_m
+        self.refused += mesh_batch(self._map.store, batch, stamp, voxel_m, self._rules, self._workspace)
 
 
 @kernel
