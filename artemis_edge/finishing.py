@@ -98,9 +98,7 @@ def _turn_right(vertices: F32, normals: F32, a: int, b: int, c: int) -> float:
 
 
 @kernel
-def _next_edge(
-    vertices: F32, normals: F32, start: I64, end: I64, used: U8, before: int, vertex: int
-) -> int:
+def _next_edge(vertices: F32, normals: F32, start: I64, end: I64, used: U8, before: int, vertex: int) -> int:
     """Index of the free edge that bounds the same hole after ``before`` - ``vertex``; -1 none.
 
     Where several pieces of surface touch in a vertex, it is the first one clockwise: a hole lies to the left of

@@ -1,8 +1,10 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from artemis_edge.errors import InputError
-from artemis_edge.frames import LidarScan, SyncedFrame, Trajectory
+from artemis_edge.frames import ImuSamples, LidarScan, SyncedFrame, Trajectory
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.given_poses import GivenPoses
 
@@ -65,3 +67,48 @@ def test_bad_trajectories_are_refused():
     ):
         with pytest.raises(InputError, match=words):
             GivenPoses(trajectory)
+
+
+def shaken(t):
+    """A pose of a hand that turns, T_world_lidar (4, 4)."""
+    turn = 0.3 * np.sin(9.0 * t)
+    return START @ se3.exp(
+        np.array([1.2 * t, 0.02 * np.sin(12 * t), 0, 0.2 * turn, 0.3 * np.cos(7 * t), turn])
+    )
+
+
+def shaken_frame(stamp_s, gyro_bias=0.0):
+    """A frame of 100 ms that looks at fixed points of the world, with gyroscope samples at 200 Hz."""
+    rng = np.random.default_rng(0)
+    world = rng.uniform(-15, 15, (60, 3)) + (5, 6, 7)
+    time_s = np.linspace(-0.05, 0.05, 60).astype(np.float32)
+    points = [
+        (se3.inverse(shaken(stamp_s + float(t))) @ np.r_[p, 1.0])[:3]
+        for t, p in zip(time_s, world, strict=True)
+    ]
+    at = stamp_s + np.arange(-0.06, 0.0601, 0.005)
+    gyro = [se3.log(se3.inverse(shaken(t - 1e-4)) @ shaken(t + 1e-4))[3:] / 2e-4 + gyro_bias for t in at]
+    imu = ImuSamples(np.rint(at * 1e9).astype(np.int64), np.array(gyro), np.zeros((len(at), 3)))
+    scan = LidarScan(np.array(points, np.float32), round(stamp_s * 1e9), time_s)
+    return SyncedFrame(0, round(stamp_s * 1e9), (scan,), imu=imu), world
+
+
+def error_of(poses_s, imu):
+    """Largest error of the de-skewed points in the world when poses at these times are given, metres."""
+    seen, world = shaken_frame(1.0)
+    given = Trajectory(
+        np.rint(np.asarray(poses_s) * 1e9).astype(np.int64), np.array([shaken(t) for t in poses_s])
+    )
+    if not imu:
+        seen = dataclasses.replace(seen, imu=ImuSamples.empty())
+    tracked = GivenPoses(given).track(seen)
+    moved = tracked.scans[0].points @ tracked.T_world_lidar[:3, :3].T + tracked.T_world_lidar[:3, 3]
+    return float(np.linalg.norm(moved - world, axis=1).max())
+
+
+def test_motion_within_a_scan_follows_what_is_known_of_it():
+    sparse, dense = np.arange(0.5, 1.55, 0.1), np.arange(0.9, 1.1, 0.0025)
+    assert error_of(sparse, imu=False) > 0.05, "one twist a scan does not do"
+    assert error_of(sparse, imu=True) < 0.03
+    assert error_of(dense, imu=False) < 0.005
+    assert error_of(dense, imu=True) < 0.005

@@ -228,6 +228,31 @@ def test_living_vertices_keep_their_distance() -> None:
     assert np.quantile(gap.min(axis=1), 0.02) > 0.8 * 0.6 * voxel_map.cell_m
 
 
+def test_a_far_wall_may_be_as_thick_as_its_noise() -> None:
+    """The same scatter is noise at 40 m, where a beam's angle is worth 4 cm, and structure at 5 m."""
+    scatter = {}
+    for distance in (5.0, 40.0):
+        rng = np.random.default_rng(8)
+        wall = naive.rectangle(rng, (distance + 0.05, -1, -1), (0, 2, 0), (0, 0, 2), 3000, 0.03)
+        voxel_map = VoxelMap(CONFIG, 1.0)
+        voxel_map.insert(naive.frame_of(wall), 1)
+        vertex = _refresh(voxel_map, least_evidence=5.0)
+        scatter[distance] = float(np.median(np.abs(vertex[:, 0] - distance - 0.05)))
+    assert scatter[40.0] < 0.005
+    assert scatter[5.0] > 1.3 * scatter[40.0]
+
+
+def test_points_in_layers_keep_the_normal_of_their_plane() -> None:
+    """A relief of two layers is no plane, but its vertices do not look along the grazing beam either."""
+    rng = np.random.default_rng(9)
+    layers = [naive.rectangle(rng, (-1, 0.05 + d, -1), (2, 0, 0), (0, 0, 2), 6000, 0.005) for d in (0, 0.08)]
+    voxel_map = VoxelMap(CONFIG, 1.0)
+    voxel_map.insert(naive.frame_of(np.concatenate(layers), (-8, -2, 0)), 1)
+    vertex = _refresh(voxel_map, least_evidence=5.0)
+    inner = np.abs(vertex[:, [0, 2]]).max(axis=1) < 0.8
+    assert np.median(vertex[inner, 4]) < -0.9
+
+
 def test_little_evidence_makes_no_vertex() -> None:
     voxel_map = VoxelMap(CONFIG, 1.0)
     voxel_map.insert(naive.frame_of(np.array([[3.0, 0.05, 0.05]])), 1)
@@ -292,7 +317,7 @@ def test_new_vertices_tell_only_the_neighbours_that_see_them() -> None:
     store.voxel[:27, bs.AT_MESH] = 1
     for cell in ((0, 1, 2), (3, 3, 3), (1, 2, 1), (0, 0, 3)):
         store.voxel[:27, bs.FRESH] = 0
-        vm._tell_neighbours(store, neighbour, *cell, 1, 5)
+        vm._tell_neighbours(store, neighbour, cc.code_of(*(12 + c for c in cell)), 1, 5)
         for k, u in enumerate(neighbour):
             d = (k // 9 - 1, (k // 3) % 3 - 1, k % 3 - 1)
             sees = all(s == 0 or c == (0 if s < 0 else 3) for s, c in zip(d, cell, strict=True))

@@ -16,7 +16,9 @@ _FUSED = {"contract"}
 
 
 @njit(fastmath=_FUSED)
-def move_points(points: F32, time_s: F64 | F32, shift_s: float, motion: ScanMotion, T_lidar_sensor: F64) -> F32:
+def move_points(
+    points: F32, time_s: F64 | F32, shift_s: float, motion: ScanMotion, T_lidar_sensor: F64
+) -> F32:
     """Points float32 (n, 3) of the sensor at their own times, as seen in the lidar frame at the reference time.
 
     ``time_s`` (n,) float seconds, to which ``shift_s`` is added, relative to the reference. With t the time in
@@ -31,7 +33,13 @@ def move_points(points: F32, time_s: F64 | F32, shift_s: float, motion: ScanMoti
     for i in range(n):
         since = time_s[i] + shift_s - motion.start_s
         k = min(max(int(np.floor(since / motion.step_s)), 0), pieces - 1) if pieces > 1 else 0
-        v, w, a, b, T = motion.twist[k, :3], motion.twist[k, 3:], turn[k], turn2[k], motion.T_reference_lidar[k]
+        v, w, a, b, T = (
+            motion.twist[k, :3],
+            motion.twist[k, 3:],
+            turn[k],
+            turn2[k],
+            motion.T_reference_lidar[k],
+        )
         t = since - k * motion.step_s
         s, c, d = _series(t, (w[0] * w[0] + w[1] * w[1] + w[2] * w[2]) * t * t)
         x, y, z = points[i, 0], points[i, 1], points[i, 2]

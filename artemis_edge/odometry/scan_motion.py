@@ -34,7 +34,9 @@ class ScanMotion(NamedTuple):
     def at(self, time_s: float) -> F64:
         """T_reference_lidar (4, 4) at a time after the reference, s."""
         k = int(np.clip((time_s - self.start_s) // self.step_s, 0, len(self.twist) - 1))
-        T: F64 = self.T_reference_lidar[k] @ se3.exp((time_s - self.start_s - k * self.step_s) * self.twist[k])
+        T: F64 = self.T_reference_lidar[k] @ se3.exp(
+            (time_s - self.start_s - k * self.step_s) * self.twist[k]
+        )
         return T
 
     def referred_to(self, time_s: float) -> ScanMotion:
@@ -57,10 +59,7 @@ def times(first_s: float, last_s: float) -> F64:
 def through(time_s: F64, T_reference_lidar: F64) -> ScanMotion:
     """Pieces between poses (k + 1, 4, 4) at equally spaced times (k + 1,) relative to the reference."""
     step = float(time_s[1] - time_s[0])
-    twists = [
-        se3.log(se3.inverse(a) @ b) / step
-        for a, b in pairwise(T_reference_lidar)
-    ]
+    twists = [se3.log(se3.inverse(a) @ b) / step for a, b in pairwise(T_reference_lidar)]
     return ScanMotion(float(time_s[0]), step, np.ascontiguousarray(T_reference_lidar[:-1]), np.array(twists))
 
 
