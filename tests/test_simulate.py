@@ -435,6 +435,15 @@ def test_a_strip_across_a_wide_gap_is_bridging() -> None:
     assert report.winding["nearest"].share > 0.99
 
 
+def test_what_hangs_where_something_moved_is_a_ghost() -> None:
+    world, mesh = bridged(gap=1.0, spacing=0.1)
+    alone = truth.evaluate_against_world(mesh, world)
+    strip = np.stack(np.meshgrid(np.linspace(2, 3, 41), np.linspace(0, 2, 81), [0.0]), axis=-1).reshape(-1, 3)
+    report = truth.evaluate_against_world(mesh, world, None, strip.astype(np.float32))
+    assert alone.ghost_area_share == report.bridging_area_share == 0.0
+    assert report.ghost_area_share == alone.bridging_area_share > 0
+
+
 def test_a_strip_across_a_narrow_gap_is_not() -> None:
     world, mesh = bridged(gap=0.25, spacing=0.1)
     assert truth.evaluate_against_world(mesh, world).bridging_area_share == 0.0

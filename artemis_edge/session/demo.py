@@ -18,7 +18,7 @@ from artemis_edge.runtime import Outcome, Request, reprocess
 from artemis_edge.session.report import Evaluation
 from artemis_edge.session.results import prepare
 from artemis_edge.session.simulate import simulate
-from artemis_edge.session.truth import evaluate_against_world, read_reference
+from artemis_edge.session.truth import evaluate_against_world, read_moving, read_reference
 from artemis_edge.trajectory import inverse, read_tum
 
 SESSION = "session"
@@ -52,7 +52,7 @@ def measure(mesh: Mesh, trajectory: Trajectory, truth: Path) -> Evaluation:
     reference = read_reference(truth / "reference.ply")
     T_truth_world = true_path.T_world_lidar[0] @ inverse(trajectory.T_world_lidar[0])
     moved = replace(mesh, vertices=_moved(mesh.vertices, T_truth_world))
-    world = evaluate_against_world(moved, read_mesh(truth / "mesh.ply"), reference)
+    world = evaluate_against_world(moved, read_mesh(truth / "mesh.ply"), reference, read_moving(truth))
     scores = evaluate_mesh(moved, reference.points, crop=True)
     near = near_path(scores.comparisons[0], true_path.T_world_lidar[:, :3, 3], NEAR_M)
     return Evaluation(
@@ -119,7 +119,11 @@ def _measured(found: dict[str, Any], length_m: float) -> list[tuple[str, str]]:
             f"{_percent(world['facing_wound_share'])} by where they were seen from, "
             f"{_percent(world['wound_share'])} by the nearest normal",
         ),
-        ("bridging a gap", f"{_percent(world['bridging_area_share'])} of the area"),
+        (
+            "bridging a gap",
+            f"{_percent(world['bridging_area_share'])} of the area; "
+            f"{_percent(world['ghost_area_share'])} are ghosts of what moved",
+        ),
         ("edges", f"{edges['non_manifold_share']:.2%} non-manifold, {edges['boundary_share']:.2%} boundary"),
         (
             "path",

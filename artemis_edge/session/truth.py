@@ -6,6 +6,7 @@ that can see them. *Bridging*: a point of a triangle hangs in air when it is fur
 than BRIDGE times the local spacing, which is the median length of the edges that touch the triangle's corners (its
 one-ring). A gap of width g has its middle g/2 from both rims, so BRIDGE = 1.5 finds what spans a gap wider than
 three spacings. A spacing finer than SPACING_FLOOR_M counts as that, so that sensor noise does not count as a bridge.
+What hangs within NEAR_M of where beams met moving things is no bridge but a ghost, and counted as that.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import numpy as np
 from artemis_drivers.virtual.proximity import anything_within
 from artemis_drivers.virtual.raycast import build_bvh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from artemis_edge.errors import InputError
-from artemis_edge.export.ply import Mesh, read_mesh
+from artemis_edge.export.ply import Mesh, read_mesh, read_points
 from artemis_edge.frames import F32, F64, I32, U8, Bool
 from artemis_edge.session.truth_files import REFERENCE_POINT
 from artemis_edge.session.winding import NEAR_M, Verdict, near, verdicts
@@ -62,12 +64,14 @@ class Winding:
 @dataclass(frozen=True, slots=True)
 class TruthReport:
     """``winding`` by judge (nearest, mean, facing), ``classes`` the same by the class of the nearest observed
-    point; ``bridging_area_share``: of the whole area ``area_m2``, what hangs in air.
+    point; ``bridging_area_share``: of the whole area ``area_m2``, what hangs in air; ``ghost_area_share``: what
+    hangs where something moved.
     """
 
     winding: dict[str, Winding]
     classes: dict[str, dict[str, Winding]]
     bridging_area_share: float
+    ghost_area_share: float
     triangles: int
     area_m2: float
 
@@ -82,13 +86,16 @@ class TruthReport:
                 out[f"{prefix}judged"] = found.judged
         return out | {
             "bridging_area_share": self.bridging_area_share,
+            "ghost_area_share": self.ghost_area_share,
             "triangles": self.triangles,
             "area_m2": self.area_m2,
         }
 
 
-def evaluate_against_world(mesh: Mesh, world: Mesh, observed: Reference | None = None) -> TruthReport:
-    """Judge ``mesh`` by the world mesh, both in the same frame.
+def evaluate_against_world(
+    mesh: Mesh, world: Mesh, observed: Reference | None = None, moving: F32 | None = None
+) -> TruthReport:
+    """Judge ``mesh`` by the world mesh, both in the same frame; ``moving`` (n, 3): where beams met what moves.
 
     ``observed`` (truth/reference.ply) judges the winding, because inside walls and under cars surfaces touch
     that no sensor can tell apart. Without it all of the world's surfaces do. Raises InputError when either mesh
@@ -103,11 +110,12 @@ def evaluate_against_world(mesh: Mesh, world: Mesh, observed: Reference | None =
     found = near(corners.mean(axis=1), judge.points, judge.normals)
     said = verdicts(normal, found, judge.normals, judge.views)
     class_of = None if judge.labels is None else judge.labels[np.maximum(found.nearest, 0)]
-    bridged = _bridged_area(corners, area, _local_spacing(mesh), surface)
+    bridged, ghosts = _hanging_area(corners, area, _local_spacing(mesh), surface, moving)
     return TruthReport(
         winding={name: _winding(verdict, area) for name, verdict in said.items()},
         classes={} if class_of is None else _by_class(said, area, class_of, judge.label_names),
-        bridging_area_share=_share(bridged.sum(), area.sum()),
+        bridging_area_share=_share(bridged, area.sum()),
+        ghost_area_share=_share(ghosts, area.sum()),
         triangles=len(corners),
         area_m2=float(area.sum()),
     )
@@ -117,7 +125,15 @@ def evaluate_files(mesh: Path, truth: Path) -> TruthReport:
     """Judge the mesh in a PLY file by a session's ``truth/`` folder; raises InputError as the readers do."""
     reference = truth / "reference.ply"
     observed = read_reference(reference) if reference.exists() else None
-    return evaluate_against_world(read_mesh(mesh), read_mesh(truth / "mesh.ply"), observed)
+    return evaluate_against_world(
+        read_mesh(mesh), read_mesh(truth / "mesh.ply"), observed, read_moving(truth)
+    )
+
+
+def read_moving(truth: Path) -> F32 | None:
+    """Where beams met what moves, float32 (n, 3), if the session says; InputError if it cannot be read."""
+    path = truth / "moving.ply"
+    return read_points(path).points if path.exists() else None
 
 
 def read_reference(path: Path) -> Reference:
@@ -202,14 +218,19 @@ def _grouped_median(group: NDArray[np.int64], value: F64, groups: int) -> F64:
     return out
 
 
-def _bridged_area(corners: F64, area: F64, spacing: F64, surface: F64) -> F64:
-    """Per triangle the area that hangs in air: its area times the share of its samples that do."""
+def _hanging_area(
+    corners: F64, area: F64, spacing: F64, surface: F64, moving: F32 | None
+) -> tuple[float, float]:
+    """Areas (m2) that bridge and that are ghosts: of each triangle the share of its samples that does or is."""
     points, triangle = _samples(corners, area, _MESH_SPACING_M, np.random.default_rng(_SEED))
     bvh = build_bvh(surface.astype(np.float32))
-    hanging = ~anything_within(bvh, points, BRIDGE * spacing[triangle])
+    hanging = np.flatnonzero(~anything_within(bvh, points, BRIDGE * spacing[triangle]))
     taken = np.bincount(triangle, minlength=len(corners))
-    hung = np.bincount(triangle, hanging.astype(np.float64), minlength=len(corners))
-    return np.asarray(area * hung / np.maximum(taken, 1))
+    each = (area / np.maximum(taken, 1))[triangle[hanging]]
+    ghost = np.zeros(len(hanging), bool)
+    if moving is not None and len(moving):
+        ghost = np.isfinite(cKDTree(moving).query(points[hanging], distance_upper_bound=NEAR_M)[0])
+    return float(each[~ghost].sum()), float(each[ghost].sum())
 
 
 def _samples(

@@ -3,8 +3,8 @@
     .venv/bin/python tests/bench/worlds.py [--worlds street hall] [--seed 1] [--seconds 20] [--json FILE]
 
 Each world is simulated and mapped (``reprocess --poses truth/trajectory_400hz.tum``) into a temporary folder, or into
-``--out``. F1 at 5 and 10 cm against the observed surface, recall weighted by nothing: classes of which less than
-LEAST_POINTS was observed are left out of the table, not of the JSON. Mesh on things that moved is left out of the
+``--out``. F1 at 5 and 10 cm against the observed surface; classes with fewer than LEAST_POINTS points of it are left
+out of the table, not of the JSON. Mesh on things that moved is left out of the
 precision of ``all`` and of the classes, and counted beside.
 """
 
@@ -21,11 +21,17 @@ from artemis_drivers.virtual.catalogue import worlds
 
 from artemis_edge.config import load
 from artemis_edge.evaluate.by_class import Score, score_classes
-from artemis_edge.export.ply import read_mesh, read_points
+from artemis_edge.export.ply import read_mesh
 from artemis_edge.progress import progress, say
 from artemis_edge.runtime import Request, reprocess
 from artemis_edge.session.simulate import simulate
-from artemis_edge.session.truth import Winding, evaluate_against_world, read_reference
+from artemis_edge.session.truth import (
+    TruthReport,
+    Winding,
+    evaluate_against_world,
+    read_moving,
+    read_reference,
+)
 
 TAUS_M = (0.05, 0.1)
 LEAST_POINTS = 1000
@@ -42,10 +48,10 @@ def measure(world: str, seed: int, seconds: float, lidar: str, out: Path, sets: 
         outcome = reprocess(request, report)
     mesh = read_mesh(out / "mesh.ply")
     reference = read_reference(made.truth / "reference.ply")
-    moving = read_points(made.truth / "moving.ply").points
+    moving = read_moving(made.truth)
     assert reference.labels is not None
     names = {0: "background", **reference.label_names}
-    truth = evaluate_against_world(mesh, read_mesh(made.truth / "mesh.ply"), reference)
+    truth = evaluate_against_world(mesh, read_mesh(made.truth / "mesh.ply"), reference, moving)
     scores = {
         f"{tau:g}": score_classes(mesh, reference.points, reference.labels, names, tau, moving)
         for tau in TAUS_M
@@ -65,7 +71,8 @@ def measure(world: str, seed: int, seconds: float, lidar: str, out: Path, sets: 
         "winding": {judge: _winding(w) for judge, w in truth.winding.items()},
         "winding_by_class": classes,
         "bridging_area_share": truth.bridging_area_share,
-        "table": table(world, scores, truth.winding, truth.classes, truth.bridging_area_share),
+        "ghost_area_share": truth.ghost_area_share,
+        "table": table(world, scores, truth),
     }
 
 
@@ -75,31 +82,26 @@ def _winding(found: Winding) -> dict[str, float | int | None]:
     return plain | {"judged": found.judged}
 
 
-def table(
-    world: str,
-    scores: dict[str, dict[str, Score]],
-    winding: dict[str, Winding],
-    classes: dict[str, dict[str, Winding]],
-    bridging: float,
-) -> str:
+def table(world: str, scores: dict[str, dict[str, Score]], truth: TruthReport) -> str:
     """Rows of a Markdown table: the world, then its classes, those with the most points first."""
     fine, coarse = (scores[f"{tau:g}"] for tau in TAUS_M)
     shown = sorted(fine, key=lambda name: -fine[name].points)
+    hanging = f"{_percent(truth.bridging_area_share)}, {_percent(truth.ghost_area_share)}"
     rows = []
     for name in shown:
         if fine[name].points < LEAST_POINTS:
             continue
-        judged = winding if name == "all" else classes.get(name, {})
+        judged = truth.winding if name == "all" else truth.classes.get(name, {})
         wound = " | ".join(_percent(judged[j].share) if j in judged else "-" for j in JUDGES)
         rows.append(
             f"| {world} | {name} | {_score(fine[name])} | {_score(coarse[name])} | {wound} | "
-            f"{_percent(bridging) if name == 'all' else ''} | {fine[name].points} |"
+            f"{hanging if name == 'all' else ''} | {fine[name].points} |"
         )
     return "\n".join(rows)
 
 
 HEADER = (
-    "| world | class | F1 5 cm (P, R) | F1 10 cm (P, R) | wound, nearest | wound, mean | facing | bridging | "
+    "| world | class | F1 5 cm (P, R) | F1 10 cm (P, R) | wound, nearest | wound, mean | facing | bridging, ghosts | "
     "points |\n|---|---|---|---|---|---|---|---|---|"
 )
 
