@@ -57,7 +57,7 @@ def test_the_rim_of_the_sheet_and_wide_holes_stay_open() -> None:
 
 
 def test_free_edges_are_those_without_a_twin() -> None:
-    vertices, _, faces = sheet(5)
+    _, _, faces = sheet(5)
     free = finishing.free_edges(faces)
     found = {
         (int(f[k]), int(f[(k + 1) % 3]))

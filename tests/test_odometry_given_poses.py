@@ -80,10 +80,10 @@ def shaken(t):
 def shaken_frame(stamp_s, gyro_bias=0.0):
     """A frame of 100 ms that looks at fixed points of the world, with gyroscope samples at 200 Hz."""
     rng = np.random.default_rng(0)
-    world = rng.uniform(-15, 15, (60, 3)) + (5, 6, 7)
+    world = rng.uniform(-15, 15, (60, 3)) + np.array([5.0, 6.0, 7.0])
     time_s = np.linspace(-0.05, 0.05, 60).astype(np.float32)
     points = [
-        (se3.inverse(shaken(stamp_s + float(t))) @ np.r_[p, 1.0])[:3]
+        (se3.inverse(shaken(stamp_s + float(t))) @ np.append(p, 1.0))[:3]
         for t, p in zip(time_s, world, strict=True)
     ]
     at = stamp_s + np.arange(-0.06, 0.0601, 0.005)
