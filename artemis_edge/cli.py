@@ -111,7 +111,7 @@ def _config_options(parser: argparse.ArgumentParser) -> None:
 
 def _demo(commands: Any) -> None:
     parser = _command(commands, "demo", run_demo, "walk through a virtual world, map it, measure the map")
-    parser.add_argument("--world", default="street", metavar="NAME", help="virtual world (default: street)")
+    parser.add_argument("--world", default="street", metavar="NAME", help="as of simulate (default: street)")
     parser.add_argument(
         "--seconds", type=float, default=_DEMO_SECONDS, help="length of the walk (default: 20)"
     )
@@ -122,11 +122,18 @@ def _simulate(commands: Any) -> None:
     parser = _command(
         commands, "simulate", run_simulate, "record a session in a virtual world, with its truth"
     )
-    parser.add_argument("world", metavar="WORLD", help="virtual world, for example street")
+    parser.add_argument(
+        "world",
+        metavar="WORLD",
+        help="street, courtyard, hall, corridor, facade, or a .glb, .gltf or .obj file",
+    )
     parser.add_argument("--seed", type=int, default=_SEED, help="which of its variants (default: 1)")
     parser.add_argument("--seconds", type=float, default=_SIMULATED_SECONDS, help="length (default: 20)")
-    parser.add_argument("--lidar", default="avia", help="virtual LiDAR (default: avia)")
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="sets")
+    parser.add_argument("--lidar", default="avia", help="avia, mid360 or hdl64 (default: avia)")
+    parser.add_argument(
+        "--set", metavar="KEY=VALUE", action="append", default=[], dest="sets",
+        help="one setting (docs/virtual-rig.md lists them); may be repeated",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, metavar="SESSION", help="folder to write")
 
 
@@ -242,7 +249,7 @@ def run_demo(given: argparse.Namespace) -> int:
 
 def run_simulate(given: argparse.Namespace) -> int:
     """``artemis-edge simulate``."""
-    from artemis_edge.progress import progress
+    from artemis_edge.progress import progress, say
     from artemis_edge.session.results import prepare
     from artemis_edge.session.simulate import simulate
 
@@ -250,6 +257,8 @@ def run_simulate(given: argparse.Namespace) -> int:
     prepare(given.out)
     with progress("simulating") as report:
         made = simulate(given.world, given.seed, given.seconds, given.lidar, given.out, settings, report)
+    for note in made.notes:
+        say(f"note: {note}")
     print(f"{made.session}: {made.frames} frames, {made.points} points, {made.images} photographs")
     print(f"{made.truth}: truth of a walk of {made.length_m:.1f} m")
     return DONE

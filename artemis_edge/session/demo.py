@@ -36,6 +36,8 @@ def demo(world: str, seconds: float, seed: int, out: Path) -> str:
     say(f"recording a walk of {seconds:g} s through the virtual world '{world}'")
     with progress("recording") as report:
         made = simulate(world, seed, seconds, "avia", session, _SETTINGS, report)
+    for note in made.notes:
+        say(f"note: {note}")
     say("mapping it by its own odometry (the truth is only for measuring)")
     request = Request(session, out, own_odometry=True)
     with progress("mapping") as report:

@@ -38,41 +38,47 @@ LEAST_POINTS = 1000
 JUDGES = ("nearest", "mean", "facing")
 
 
-def measure(world: str, seed: int, seconds: float, lidar: str, out: Path, sets: list[str]) -> dict[str, Any]:
-    """Simulate, map and measure one world."""
+def make(world: str, seed: int, seconds: float, lidar: str, out: Path, sets: list[str]) -> None:
+    """Simulate and map one world."""
     session = out / "session"
     with progress(f"recording {world}") as report:
         made = simulate(world, seed, seconds, lidar, session, {"camera": "off"}, report)
     request = Request(session, out, load(sets=sets), poses=made.truth / "trajectory_400hz.tum")
     with progress(f"mapping {world}") as report:
-        outcome = reprocess(request, report)
-    mesh = read_mesh(out / "mesh.ply")
-    reference = read_reference(made.truth / "reference.ply")
-    moving = read_moving(made.truth)
+        reprocess(request, report)
+
+
+def measure(out: Path) -> dict[str, Any]:
+    """Judge what :func:`make` wrote."""
+    where = out / "session" / "truth"
+    said = json.loads((where / "world.json").read_text())
+    run = json.loads((out / "report.json").read_text())
+    mesh, reference, moving = (
+        read_mesh(out / "mesh.ply"),
+        read_reference(where / "reference.ply"),
+        read_moving(where),
+    )
     assert reference.labels is not None
     names = {0: "background", **reference.label_names}
-    truth = evaluate_against_world(mesh, read_mesh(made.truth / "mesh.ply"), reference, moving)
+    truth = evaluate_against_world(mesh, read_mesh(where / "mesh.ply"), reference, moving)
     scores = {
         f"{tau:g}": score_classes(mesh, reference.points, reference.labels, names, tau, moving)
         for tau in TAUS_M
     }
     classes = {name: {j: _winding(w) for j, w in found.items()} for name, found in truth.classes.items()}
     return {
-        "world": world,
-        "seed": seed,
-        "lidar": lidar,
-        "length_m": made.length_m,
-        "reference_points": made.reference_points,
-        "moving_points": made.moving_points,
+        **{key: said[key] for key in ("world", "seed", "seconds", "lidar")},
+        "reference_points": len(reference.points),
+        "moving_points": 0 if moving is None else len(moving),
         "triangles": truth.triangles,
         "area_m2": truth.area_m2,
-        "frame_ms": outcome.report["frame_ms"],
+        "frame_ms": run["frame_ms"],
         "f1": {tau: {name: s.to_json() for name, s in found.items()} for tau, found in scores.items()},
         "winding": {judge: _winding(w) for judge, w in truth.winding.items()},
         "winding_by_class": classes,
         "bridging_area_share": truth.bridging_area_share,
         "ghost_area_share": truth.ghost_area_share,
-        "table": table(world, scores, truth),
+        "table": table(said["world"], scores, truth),
     }
 
 
@@ -122,6 +128,7 @@ def main() -> int:
     parser.add_argument("--lidar", default="avia")
     parser.add_argument("--set", action="append", default=[], dest="sets", help="setting of the mapping")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="keep sessions and meshes here")
+    parser.add_argument("--again", action="store_true", help="only measure again what is in --out")
     parser.add_argument("--json", type=Path, metavar="FILE")
     given = parser.parse_args()
     found = []
@@ -129,7 +136,9 @@ def main() -> int:
         for world in given.worlds:
             out = (given.out or Path(scratch)) / Path(world).stem
             out.mkdir(parents=True, exist_ok=True)
-            found.append(measure(world, given.seed, given.seconds, given.lidar, out, given.sets))
+            if not given.again:
+                make(world, given.seed, given.seconds, given.lidar, out, given.sets)
+            found.append(measure(out))
             say(found[-1]["table"])
     print(HEADER)
     for row in found:

@@ -16,6 +16,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from artemis_drivers._jit import njit
 from artemis_drivers.virtual.mesh_builder import F32, F64, I32, U8
 from artemis_drivers.virtual.scene import Scene
 from artemis_drivers.virtual.sensor import (
@@ -45,6 +46,7 @@ from artemis_drivers.virtual.spans import Canvas, View, clear, draw, new_canvas
 
 _OVERSAMPLING = 2.0  # canvas pixels per image pixel, along each axis
 _UNDISTORT_STEPS = 30
+_UNDISTORTED2 = 1e-28  # squared correction that is no more than rounding
 
 #: T_world_cam (4, 4) at a time in seconds.
 CameraPath = Callable[[float], F64]
@@ -105,11 +107,25 @@ def distort(x: F64, y: F64, k: tuple[float, float, float, float, float]) -> tupl
 
 def undistort(xd: F64, yd: F64, k: tuple[float, float, float, float, float]) -> tuple[F64, F64]:
     """Inverse of :func:`distort` by fixed-point iteration (converges for mild lenses, |k1| r2 < 0.3)."""
-    x, y = xd.copy(), yd.copy()
-    for _ in range(_UNDISTORT_STEPS):
-        ex, ey = distort(x, y, k)
-        x, y = x + (xd - ex), y + (yd - ey)
+    x, y = np.empty(np.shape(xd)), np.empty(np.shape(xd))
+    _undistort(np.ravel(xd), np.ravel(yd), k, x.reshape(-1), y.reshape(-1))
     return x, y
+
+
+@njit
+def _undistort(xd: F64, yd: F64, k: tuple[float, float, float, float, float], out_x: F64, out_y: F64) -> None:
+    k1, k2, p1, p2, k3 = k
+    for i in range(len(xd)):
+        x, y = xd[i], yd[i]
+        for _ in range(_UNDISTORT_STEPS):
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            ex = xd[i] - (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x))
+            ey = yd[i] - (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+            x, y = x + ex, y + ey
+            if ex * ex + ey * ey < _UNDISTORTED2:
+                break
+        out_x[i], out_y[i] = x, y
 
 
 @dataclass(slots=True)
