@@ -153,7 +153,7 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 3.0
     most_voxels: Annotated[
         int, Meta(description="Voxels meshed in one frame at most; the rest waits.", ge=1)
-    ] = 600
+    ] = 500
     smallest_island: Annotated[
         int, Meta(description="Islands of fewer triangles are left out of the finished mesh.", ge=1)
     ] = 4
