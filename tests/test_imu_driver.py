@@ -1,7 +1,6 @@
 """The serial IMU driver against the virtual MTi on a pseudo terminal, and VectorNav against a scripted port."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,20 +16,13 @@ from artemis_drivers.imu_serial.settings import MtiSettings, SyncSetting, Vector
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.virtual.wire_imu import MtiFaults, WireMti
 
+from tests.waiting import until
+
 Vector = tuple[float, float, float]
 
 
 def still(truth_ns: int) -> tuple[Vector, Vector]:
     return (0.25, -0.5, 0.125), (0.0, 0.5, 9.75)
-
-
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.005)
-    return True
 
 
 def rings() -> tuple[Ring, Ring]:

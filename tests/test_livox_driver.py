@@ -3,7 +3,7 @@
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from ipaddress import IPv4Address, IPv4Network
 
@@ -28,6 +28,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import livox_ports
+from tests.waiting import until
 
 MS = 1_000_000
 SECOND = 1_000 * MS
@@ -37,16 +38,6 @@ SECOND = 1_000 * MS
 def ports() -> Iterator[None]:
     with livox_ports.reserved():
         yield
-
-
-def until(condition: Callable[[], bool], seconds: float = 6.0) -> bool:
-    """Whether the condition came true in time."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.01)
-    return condition()
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -25,6 +25,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import livox_ports
+from tests.waiting import until
 
 MS = 1_000_000
 PERIOD = 480_000  # 96 points at 200 kHz
@@ -169,13 +170,6 @@ def test_each_kind_of_bad_packet_has_its_counter() -> None:
     ]
     c = feed([(0, p) for p in wrong]).counters()
     assert [c[f"bad_{k}"] for k in ("version", "type", "length", "time")] == [1, 1, 3, 1]
-
-
-def until(condition: Callable[[], bool], seconds: float = 6.0) -> bool:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and not condition():
-        time.sleep(0.01)
-    return condition()
 
 
 def packets(seconds: float) -> Iterator[tuple[int, bytes]]:

@@ -16,6 +16,8 @@ from artemis_drivers.trigger.messages import Opcode
 from artemis_drivers.trigger.settings import DICTIONARY, PULSE, TriggerSettings
 from artemis_drivers.virtual.wire_trigger import TriggerFaults, WireTrigger
 
+from tests.waiting import until
+
 
 class Rig:
     """A virtual board, its driver and the truth about its edges."""
@@ -47,15 +49,6 @@ class Rig:
     @property
     def counters(self) -> dict[str, int]:
         return dict(self.board.health()[0].counters)
-
-
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.005)
-    return True
 
 
 def running(rig: Rig) -> bool:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from artemis_drivers.base import Applied, DriverError, Health, State
+from artemis_drivers.base import DriverError, State
+from artemis_drivers.device_thread import DeviceThread
 from artemis_drivers.imu_serial.link import Port, SerialPort
 from artemis_drivers.imu_serial.mtdata2 import MalformedError
 from artemis_drivers.imu_serial.samples import IMU_SAMPLE, Sample, protocol
@@ -21,10 +21,9 @@ IMU_CHUNK = np.dtype([("rx_ns", "i8"), ("size", "i4"), ("data", "u1", (CHUNK_BYT
 """Bytes as they arrived: ``rx_ns`` is host monotonic time."""
 
 SILENT_S = 0.5  # a running IMU sends hundreds of samples a second
-_RETRY_S = (0.1, 0.2, 0.4, 0.8)  # back-off; the last one holds
 
 
-class SerialImu:
+class SerialImu(DeviceThread):
     """Driver (base.Driver) of one IMU. ``samples`` is a ring of IMU_SAMPLE, ``chunks`` one of IMU_CHUNK."""
 
     def __init__(
@@ -37,50 +36,14 @@ class SerialImu:
     ) -> None:
         if samples.dtype != IMU_SAMPLE or (chunks is not None and chunks.dtype != IMU_CHUNK):
             raise ValueError("the rings of a serial IMU hold IMU_SAMPLE and IMU_CHUNK")
+        super().__init__(settings.name)
         self.settings = settings
         self._samples, self._chunks = samples, chunks
         self._open, self._now = open_port, clock
         self._protocol = protocol(settings)
         self._splitter = FrameSplitter(self._protocol.framing)
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._state, self._message = State.STOPPED, ""
-        self._applied: tuple[Applied, ...] = ()
-        self._identity: dict[str, str] = {}
-        self._last_data_ns = 0
         self._status_word = 0
         self._counts = {"unplugged": 0, "silent": 0, "malformed_frames": 0, "other_frames": 0}
-
-    def start(self) -> None:
-        """Begin to look for the device; it may be plugged in later."""
-        if self._thread is not None:
-            raise DriverError(f"{self.settings.name} runs already: stop it before starting it again")
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name=self.settings.name, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Close the port and end the thread."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        self._become(State.STOPPED)
-
-    def health(self) -> tuple[Health, ...]:
-        """One device."""
-        return (
-            Health(
-                self.settings.name,
-                self._state,
-                self._message,
-                self._counters(),
-                self._last_data_ns,
-                dict(self._identity),
-                self._applied,
-                {"status": f"{self._status_word:#010x}"},
-            ),
-        )
 
     def take(self, chunk: bytes, rx_ns: int) -> int:
         """Decode bytes that arrived at ``rx_ns`` into the rings; returns the number of samples."""
@@ -94,7 +57,7 @@ class SerialImu:
                 port = self._connect()
             except (DriverError, OSError) as fault:
                 self._become(State.SEARCHING, str(fault))
-                self._stop.wait(_RETRY_S[min(failures, len(_RETRY_S) - 1)])
+                self._pause(failures)
                 failures += 1
                 continue
             failures = 0
@@ -112,10 +75,8 @@ class SerialImu:
         except BaseException:
             port.close()
             raise
-        self._identity = {item.item: item.read_back for item in self._applied if item.requested == "any"}
         self._splitter.abandon()
-        refused = [item.item for item in self._applied if item.status == "refused"]
-        self._become(State.RUNNING, f"{self.settings.name} refuses: {', '.join(refused)}" if refused else "")
+        self._become_running()
         return port
 
     def _read(self, port: Port) -> None:
@@ -199,5 +160,5 @@ class SerialImu:
             **self._counts,
         }
 
-    def _become(self, state: State, message: str = "") -> None:
-        self._state, self._message = state, message
+    def _status(self) -> Mapping[str, str]:
+        return {"status": f"{self._status_word:#010x}"}

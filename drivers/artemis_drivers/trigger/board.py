@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -11,7 +10,8 @@ from pathlib import Path
 import can
 import numpy as np
 
-from artemis_drivers.base import Applied, DriverError, Health, State
+from artemis_drivers.base import DriverError, State
+from artemis_drivers.device_thread import DeviceThread
 from artemis_drivers.ring import Ring
 from artemis_drivers.trigger.bus import Bus, arrival_ns, is_noise, open_bus, recover
 from artemis_drivers.trigger.clock import BoardClock, EventCounter
@@ -41,13 +41,15 @@ from artemis_drivers.trigger.settings import TriggerSettings
 
 SILENT_S = 0.9  # heartbeats come twice a second
 _RECEIVE_S = 0.05
-_RETRY_S = (0.1, 0.2, 0.4, 0.8)  # back-off; the last one holds
 _SDO_S = 0.2
 _BUTTONS = 4
 
 
-class TriggerBoard:
-    """Driver (base.Driver). ``events`` is a ring of TRIGGER_EVENT, ``frames`` one of CAN_FRAME."""
+class TriggerBoard(DeviceThread):
+    """Driver (base.Driver). ``events`` is a ring of TRIGGER_EVENT, ``frames`` one of CAN_FRAME.
+
+    Triggers go on when it stops: see ``command``.
+    """
 
     def __init__(
         self,
@@ -58,39 +60,19 @@ class TriggerBoard:
     ) -> None:
         if events.dtype != TRIGGER_EVENT or (frames is not None and frames.dtype != CAN_FRAME):
             raise ValueError("the rings of a trigger board hold TRIGGER_EVENT and CAN_FRAME")
+        super().__init__(settings.name)
         self.settings = settings
         self.messages = Messages(Path(settings.dbc) if settings.dbc else default_dbc())
         self._events, self._frames, self._open = events, frames, open_can
         self._clock = BoardClock()
         self._triggers, self._pulses = EventCounter(), EventCounter()
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self._bus: Bus | None = None
         self._outbox: deque[Record] = deque()
-        self._state, self._message = State.STOPPED, ""
-        self._applied: tuple[Applied, ...] = ()
-        self._last_ns = 0
         self._heard_s = 0.0
         self._health: BoardHealth | None = None
         self._fault: Emcy | None = None
         self._counts = {"unplugged": 0, "silent": 0, "bad_frames": 0, "other_frames": 0, "board_restarts": 0}
         self._counts |= {"overruns": 0, "unsent": 0}
-
-    def start(self) -> None:
-        """Begin to look for the board; it may be plugged in later."""
-        if self._thread is not None:
-            raise DriverError(f"{self.settings.name} runs already: stop it before starting it again")
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name=self.settings.name, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Send what is waiting, close the bus and end the thread. Triggers go on: see ``command``."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        self._become(State.STOPPED)
 
     def command(self, opcode: Opcode, led: int = 0, buzzer: int = 0) -> None:
         """Arm, run or stop the triggers, or only indicate: patterns 0..15 for LED and buzzer."""
@@ -102,25 +84,9 @@ class TriggerBoard:
         """Boot the board anew."""
         self._outbox.append(Nmt(NmtCommand.RESET, self.messages.node))
 
-    def health(self) -> tuple[Health, ...]:
-        """One device."""
-        identity = {item.item: item.read_back for item in self._applied if item.requested == "any"}
-        return (
-            Health(
-                self.settings.name,
-                self._state,
-                self._message,
-                self._counters(),
-                self._last_ns,
-                identity,
-                self._applied,
-                self._status(),
-            ),
-        )
-
     def take(self, frame_id: int, data: bytes, rx_ns: int) -> Record | None:
         """Digest a frame that arrived at ``rx_ns``: its event goes to the ring."""
-        self._last_ns = rx_ns
+        self._last_data_ns = rx_ns
         self._keep(frame_id, data, rx_ns)
         try:
             record = self.messages.decode(frame_id, data)
@@ -153,7 +119,7 @@ class TriggerBoard:
                 if failures == 0 and self._state == State.RUNNING:
                     self._counts["unplugged"] += 1
                 self._become(State.SEARCHING, f"{self.settings.name}: {fault}")
-                self._stop.wait(_RETRY_S[min(failures, len(_RETRY_S) - 1)])
+                self._pause(failures)
                 failures += 1
             finally:
                 self._close()
@@ -164,8 +130,7 @@ class TriggerBoard:
         self._become(State.CONFIGURING)
         self._applied = configure(self.settings, self._sdo)
         self._send(bus, Nmt(NmtCommand.START, self.messages.node))
-        refused = [item.item for item in self._applied if item.status == "refused"]
-        self._become(State.RUNNING, f"{self.settings.name} refuses: {', '.join(refused)}" if refused else "")
+        self._become_running()
         self._heard_s = time.monotonic()
         return bus
 
@@ -334,6 +299,3 @@ class TriggerBoard:
         if self._fault is not None:
             status["emergency"] = f"{self._fault.error_code:#06x} detail {self._fault.mfr_detail}"
         return status
-
-    def _become(self, state: State, message: str = "") -> None:
-        self._state, self._message = state, message

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from artemis_drivers.imu_serial.configure import decode_outputs, encode_outputs
 from artemis_drivers.imu_serial.mtdata2 import EVERY_PACKET, Item, Message, Mid, Type
 from artemis_drivers.imu_serial.settings import XSENS_BAUD_IDS
 from artemis_drivers.imu_serial.stream import FrameSplitter
-from artemis_drivers.virtual.wire_port import WirePort
+from artemis_drivers.virtual.wire_device import WireDevice
 
 TICKS_PER_SECOND = 10_000
 _SECOND_NS = 1_000_000_000
@@ -127,7 +126,7 @@ class MtiDevice:
         return Message(Mid.SET_BAUDRATE + 1)
 
 
-class WireMti:
+class WireMti(WireDevice):
     """The device on a pseudo terminal at ``path``, driven by the truth clock ``now`` (ns)."""
 
     def __init__(
@@ -139,59 +138,30 @@ class WireMti:
         now: Callable[[], int] = time.monotonic_ns,
         seed: int = 0,
     ) -> None:
+        super().__init__(path, "virtual MTi")
         self.device = device or MtiDevice()
-        self.port = WirePort(path)
         self.sent = 0
         self.dropped = 0
         self._motion, self._faults, self._now = motion, faults or MtiFaults(), now
         self._random = random.Random(seed)
         self._splitter = FrameSplitter(mtdata2.XbusFraming())
-        self._lock = threading.Lock()  # the port may be unplugged from outside
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self._start_ns = 0
         self._index = 0
         self._was_measuring = False
 
-    def start(self) -> None:
-        """Plug in and run in a thread."""
-        self.port.plug()
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name="virtual MTi", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Unplug and end the thread."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        self.unplug()
-
-    def unplug(self) -> None:
-        """The port vanishes; the device loses its power."""
-        with self._lock:
-            self.port.unplug()
-            self.device.measuring = self._was_measuring = False
-
-    def replug(self) -> None:
-        """The port is back; the device starts anew."""
-        with self._lock:
-            self.port.plug()
+    def _unplugged(self) -> None:
+        """Its power, and with it the measurement."""
+        self.device.measuring = self._was_measuring = False
 
     def truth_ns(self, index: int) -> int:
         """When sample ``index`` of the present measurement was taken, by the truth clock."""
         period = _SECOND_NS / self.device.rate_hz / (1 + self._faults.skew_ppm * 1e-6)
         return self._start_ns + round(index * period)
 
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            with self._lock:
-                wait_s = self._serve() if self.port.plugged else _IDLE_S
-            self._stop.wait(wait_s)
-
-    def _serve(self) -> float:
+    def _turn(self) -> float:
         """Answer what was asked, send what is due; returns how long there is nothing to do."""
+        if not self.port.plugged:
+            return _IDLE_S
         if self.port.baud() != self.device.baud:
             self.port.read(0.0)  # noise to us
             return _IDLE_S

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -46,7 +45,7 @@ from artemis_drivers.trigger.settings import (
     Entry,
     config_crc,
 )
-from artemis_drivers.virtual.wire_port import WirePort
+from artemis_drivers.virtual.wire_device import WireDevice
 
 _SECOND_US = 1_000_000
 _HEARTBEAT_US = 500_000
@@ -223,7 +222,7 @@ class Firmware:
         self.objects[entry] = value
 
 
-class WireTrigger:
+class WireTrigger(WireDevice):
     """Board and stick on a pseudo terminal at ``path``, driven by the truth clock ``now`` (ns).
 
     ``on_trigger`` and ``on_pps`` tell the virtual cameras and LiDAR of each edge.
@@ -239,9 +238,9 @@ class WireTrigger:
         now: Callable[[], int] = time.monotonic_ns,
         seed: int = 0,
     ) -> None:
+        super().__init__(path, "virtual trigger board")
         faults = faults or TriggerFaults()
         self.firmware = Firmware(faults, strobe_us)
-        self.port = WirePort(path)
         self.sent = self.lost = 0
         self.opened = False
         self._faults, self._now = faults, now
@@ -250,36 +249,15 @@ class WireTrigger:
         self._random = random.Random(seed)
         self._heard = bytearray()
         self._outbox: deque[tuple[int, Record]] = deque()
-        self._lock = threading.Lock()
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Plug in, power on and run in a thread."""
         self._queue(self.firmware.power_on(self._now()), self._now())
-        self.port.plug()
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name="virtual trigger board", daemon=True)
-        self._thread.start()
+        super().start()
 
-    def stop(self) -> None:
-        """Unplug and end the thread."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        self.unplug()
-
-    def unplug(self) -> None:
-        """The stick is pulled; the board goes on."""
-        with self._lock:
-            self.port.unplug()
-            self.opened = False
-
-    def replug(self) -> None:
-        """The stick is back."""
-        with self._lock:
-            self.port.plug()
+    def _unplugged(self) -> None:
+        """Only the stick loses its power: the board goes on."""
+        self.opened = False
 
     def press(self, button: int, *, down: bool) -> None:
         """A finger on a button."""
@@ -290,12 +268,6 @@ class WireTrigger:
         """Pull or plug the cable of the pulse per second."""
         with self._lock:
             self.firmware.pps_connected = connected
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            with self._lock:
-                wait_s = self._turn()
-            self._stop.wait(wait_s)
 
     def _turn(self) -> float:
         now = self._now()
