@@ -27,6 +27,13 @@ def u32_at(b: NDArray[np.uint8], at: int) -> np.int64:
 
 
 @kernel
+def i64_at(b: NDArray[np.uint8], at: int) -> np.int64:
+    """Signed, 8 bytes."""
+    value: np.int64 = u32_at(b, at) | u32_at(b, at + 4) << 32
+    return value
+
+
+@kernel
 def i16_at(b: NDArray[np.uint8], at: int) -> np.int64:
     """Signed, 2 bytes."""
     return np.int64(np.int16(u16_at(b, at)))

@@ -1,4 +1,4 @@
-"""What the decoders of both Livox protocols share: their rings, their counters, their state."""
+"""What the decoders of both Livox protocols share: rings, counters, state, and the IMU's packets."""
 
 from __future__ import annotations
 
@@ -8,10 +8,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from artemis_drivers.livox_slots import TRACK, imu_arrays, point_arrays
+from artemis_drivers._jit import njit
+from artemis_drivers.livox_bytes import f32_at
+from artemis_drivers.livox_slots import (
+    STANDARD_GRAVITY,
+    TRACK,
+    ImuArrays,
+    PointArrays,
+    imu_arrays,
+    point_arrays,
+)
 from artemis_drivers.ring import Ring
 
 POINTS, IMU = 0, 1  # rows of the two streams' TRACK
+IMU_PERIOD_NS = 5_000_000
 
 BAD = np.dtype([("version", "i8"), ("type", "i8"), ("length", "i8"), ("time", "i8")])
 """Packets refused: unknown header version, unknown data type, wrong length for its type, impossible date."""
@@ -28,6 +38,28 @@ class RawArrays(NamedTuple):
     data: NDArray[np.uint8]
 
 
+class Streams(NamedTuple):
+    """What kernels read and write: raw packets, slots, TRACK (2,), BAD (1,), LAST (1,)."""
+
+    raw: RawArrays
+    points: PointArrays
+    imu: ImuArrays
+    tracks: NDArray[np.void]
+    bad: NDArray[np.void]
+    last: NDArray[np.void]
+
+
+@njit
+def put_imu(
+    b: NDArray[np.uint8], header: int, stamp: int, rx: int, clock: int, number: int, imu: ImuArrays, at: int
+) -> None:
+    """IMU packet into slot ``at``: six floats after a header of so many bytes, rad/s and multiples of gravity."""
+    imu.stamp_ns[at], imu.rx_ns[at], imu.packet[at], imu.clock[at] = stamp, rx, number, clock
+    for k in range(3):
+        imu.gyro[at, k] = f32_at(b, header + 4 * k)
+        imu.accel[at, k] = f32_at(b, header + 12 + 4 * k) * STANDARD_GRAVITY
+
+
 class LivoxDecoder(ABC):
     """Decodes the raw packets of one device into a ring of points and a ring of IMU samples."""
 
@@ -37,8 +69,8 @@ class LivoxDecoder(ABC):
         self.tracks = np.zeros(2, TRACK)
         self.bad = np.zeros(1, BAD)
         self.last = np.zeros(1, LAST)
-        self.raw = RawArrays(*packets.field.values())
-        self.point_fields, self.imu_fields = point_arrays(self.points), imu_arrays(self.imu)
+        raw = RawArrays(*packets.field.values())
+        self.streams = Streams(raw, point_arrays(points), imu_arrays(imu), self.tracks, self.bad, self.last)
 
     @abstractmethod
     def _run(self, first: int, count: int, point_at: int, imu_at: int) -> tuple[int, int]:

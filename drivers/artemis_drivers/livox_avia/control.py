@@ -1,14 +1,11 @@
 """Session with one Avia: discovery, handshake, heartbeat, configuration with read-back, sampling.
 
-Without input or output of its own: datagrams go in by ``hear_*``, time by ``tick``, datagrams to be sent come
-out in ``outbox``. Sequence and times follow the official SDK v2.3.0: heartbeat every 800 ms, a device that does
-not answer for 3 s is lost, a command is repeated after 500 ms.
+Sequence and times follow the official SDK v2.3.0: heartbeat every 800 ms, a device that does not answer for 3 s is
+lost, a command is repeated after 500 ms.
 """
 
 from __future__ import annotations
 
-import ipaddress
-from collections import Counter
 from collections.abc import Callable
 
 from artemis_drivers.base import Applied, State
@@ -30,14 +27,12 @@ from artemis_drivers.livox_avia.protocol import (
 )
 from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.livox_avia.status import Status
-from artemis_drivers.livox_dialogue import MS, Ask, Datagram, Dialogue, Script
-from artemis_drivers.udp import Interface, address_facing, interfaces
+from artemis_drivers.livox_dialogue import MS, Ask, Datagram, Script
+from artemis_drivers.livox_session import LOST_NS, UNHEARD_NS, LivoxSession
+from artemis_drivers.udp import Interface, interfaces
 
 HEARTBEAT_NS = 800 * MS
-LOST_NS = 3000 * MS
-SILENT_NS = 600 * MS  # 120 IMU periods without any data packet
 RESTART_NS = 2000 * MS  # a device that answers but sends nothing is configured again
-UNHEARD_NS = 5000 * MS
 _INIT_POLL_NS = 50 * MS
 _REFUSALS = 5  # a command is repeated so often before it counts as refused
 _REFUSED_PAUSE_NS = 200 * MS
@@ -45,29 +40,21 @@ _ANSWERS_AGAIN_NS = 1000 * MS
 _NOT_TAKEN = ("no answer", "error")
 
 
-class AviaSession:
-    """State of one Avia as the host sees it."""
+class AviaSession(LivoxSession):
+    """State of one Avia as the host sees it; its serial number is its broadcast code."""
+
+    model = "Avia"
+    seq_mask = 0xFFFF
 
     def __init__(self, config: AviaConfig, own_addresses: Callable[[], list[Interface]] = interfaces) -> None:
+        super().__init__(config.host_ip, own_addresses)
         self.config = config
-        self.state = State.STOPPED
-        self.message = ""
-        self.outbox: list[Datagram] = []
-        self.counters: Counter[str] = Counter()
-        self.applied: dict[str, Applied] = {}
-        self.code = ""
-        self.device_ip = ""
-        self.firmware = ""
         self.work_state = WorkState.INIT
         self.feature = 0
         self.status_code = 0
-        self._own_addresses = own_addresses
-        self._dialogue = Dialogue(self._put_ask, self._next_seq)
-        self._seq = 0
         self._utc_seq: set[int] = set()
-        self._began = self._heartbeat_sent = self._heard = self._last_data = self._running_since = 0
+        self._heartbeat_sent = 0
         self._in_session = False  # the device has been told where to send
-        self._leaving = False
 
     @property
     def connected(self) -> bool:
@@ -75,11 +62,6 @@ class AviaSession:
         return self._in_session and self.state != State.SEARCHING
 
     # -- what the host calls ------------------------------------------------------------------------------------
-
-    def start(self, now: int) -> None:
-        """Begin to listen for the device."""
-        self._leaving = False
-        self._search("", now)
 
     def begin_stop(self, now: int) -> None:
         """Stop sampling and take leave; ``state`` is STOPPED when that is done or was not answered."""
@@ -97,7 +79,7 @@ class AviaSession:
 
     def _mine(self) -> str:
         """Code of the device sought; empty when any will do."""
-        return self.config.broadcast_code or (self.code if self.state != State.SEARCHING else "")
+        return self.config.broadcast_code or (self.serial if self.state != State.SEARCHING else "")
 
     def hear_broadcast(self, broadcast: payloads.Broadcast, ip: str, now: int) -> bool:
         """A device announced itself; True when it is (now) ours."""
@@ -129,11 +111,9 @@ class AviaSession:
             self._hear_frame(frame, now)
 
     def data_seen(self, now: int, data_type: int, status_code: int) -> None:
-        """Data packets have arrived; ``data_type`` of the latest points (0: none yet)."""
-        self._last_data = now
+        """Data packets have arrived: they tell the coordinates in use."""
         self.status_code = status_code
-        if self.state == State.SILENT:
-            self.state, self.message = State.RUNNING, self._advice()
+        super().data_seen(now, data_type, status_code)
         if data_type and self.state == State.RUNNING:
             self._seen("coordinate", "spherical" if data_type in (3, 5, 8) else "cartesian")
 
@@ -164,9 +144,8 @@ class AviaSession:
 
     def _search(self, message: str, now: int) -> None:
         """Go back to listening for the device's broadcast."""
-        self._dialogue.cancel()
         self._in_session = False
-        self.state, self.message, self._began = State.SEARCHING, message, now
+        super()._search(message, now)
 
     def _beat(self, now: int) -> None:
         """Heartbeats go on when the device is lost: when only the cable was out it answers again at once."""
@@ -176,9 +155,7 @@ class AviaSession:
             self.counters["heartbeats"] += 1
         if now - self._heard > LOST_NS and self.state != State.SEARCHING:
             self._dialogue.cancel()
-            self.counters["device_lost"] += 1
-            self.state = State.SEARCHING
-            self.message = f"the Livox Avia {self.code} does not answer any more: check its power and cable"
+            self.state, self.message = State.SEARCHING, self._gone()
 
     def _forgotten(self, now: int) -> bool:
         """A connected device announces itself again and is silent otherwise: it has restarted."""
@@ -186,36 +163,21 @@ class AviaSession:
         return self.state == State.SEARCHING or quiet > _ANSWERS_AGAIN_NS
 
     def _connect(self, code: str, ip: str, now: int) -> None:
-        host = self.config.host_ip or address_facing(ip, self._own_addresses())
+        host = self._host_facing(code, ip)
         if host is None:
-            network = ipaddress.IPv4Network(f"{ip}/24", strict=False)
-            self.message = (
-                f"the Livox Avia {code} is heard at {ip}, but this computer has no address in its network: "
-                f"give the network port one, such as {network[50]}/24"
-            )
             return
-        self.code, self.device_ip = code, ip
+        self.serial, self.device_ip = code, ip
         self._in_session = False
         self._began = self._heard = now
         self.state = State.CONNECTING  # an earlier message stands until the handshake has worked
         self._dialogue.start(self._greeting(host), now)
 
-    def _watch_data(self, now: int) -> None:
-        quiet = now - max(self._last_data, self._running_since)
-        if quiet > SILENT_NS and self.state == State.RUNNING:
-            self.counters["silences"] += 1
-            self.state = State.SILENT
-        if self.state == State.SILENT:
-            self.message = (
-                f"no data from the Livox Avia {self.code} for {quiet / 1e9:.1f} s: check its cable and power"
-            )
-            answering = now - self._heard < HEARTBEAT_NS + 500 * MS
-            if quiet > RESTART_NS and answering:
-                self._dialogue.start(self._configuration(), now)
-
-    def identity(self) -> dict[str, str]:
-        """Serial number, address, firmware."""
-        return {"serial": self.code, "address": self.device_ip, "firmware": self.firmware}
+    def _watch_data(self, now: int) -> int:
+        quiet = super()._watch_data(now)
+        answering = now - self._heard < HEARTBEAT_NS + 500 * MS
+        if self.state == State.SILENT and quiet > RESTART_NS and answering:
+            self._dialogue.start(self._configuration(), now)
+        return quiet
 
     def status(self) -> dict[str, str]:
         """The device's own status in words."""
@@ -223,10 +185,6 @@ class AviaSession:
         return {"work_state": self.work_state.name.lower()} | {
             name: str(value) for name, value in decoded.items()
         }
-
-    def resent(self) -> int:
-        """Commands that had to be repeated."""
-        return self._dialogue.resent
 
     # -- what is said -------------------------------------------------------------------------------------------
 
@@ -236,14 +194,14 @@ class AviaSession:
         answer = yield Ask(command(General.HANDSHAKE), handshake.encode(), tries=3)
         if answer is None:
             self._search(
-                f"the Livox Avia {self.code} at {self.device_ip} does not answer the handshake: let UDP ports "
+                f"the Livox Avia {self.serial} at {self.device_ip} does not answer the handshake: let UDP ports "
                 f"{COMMAND_PORT} and {self.config.command_port} through the firewall and check host_ip ({host})",
                 self._began,
             )
             return
         if answer[:1] != bytes([Ret.OK]):
             self._search(
-                f"the Livox Avia {self.code} refuses the handshake: end the other program that uses it",
+                f"the Livox Avia {self.serial} refuses the handshake: end the other program that uses it",
                 self._began,
             )
             return
@@ -269,7 +227,7 @@ class AviaSession:
         answer = yield Ask(command(General.SAMPLING), b"\1")
         if answer is None or answer[:1] != bytes([Ret.OK]):
             self._search(
-                f"the Livox Avia {self.code} does not start sampling: switch it off and on", self._heard
+                f"the Livox Avia {self.serial} does not start sampling: switch it off and on", self._heard
             )
             return
         self._running_since = self._heard
@@ -318,7 +276,7 @@ class AviaSession:
             self._hear_heartbeat(frame.payload, now)
         elif key == command(Lidar.UTC) and frame.seq in self._utc_seq:
             self._utc_seq.clear()
-            self.counters["utc_accepted" if frame.payload[:1] == b"\0" else "utc_refused"] += 1
+            self._count_utc(frame.payload)
         else:
             self._heard = now
             if not self._dialogue.answer(frame.seq, key, frame.payload, now):
@@ -338,22 +296,18 @@ class AviaSession:
             WorkState(beat.work_state) if beat.work_state in list(WorkState) else WorkState.ERROR
         )
         if self.work_state == WorkState.INIT:
-            self.message = f"the Livox Avia {self.code} is starting up: {beat.detail} %"
+            self.message = f"the Livox Avia {self.serial} is starting up: {beat.detail} %"
         else:
             self.status_code = beat.detail
             self._seen("rain_fog", str(bool(self.feature & 1)))
             if self.state in (State.RUNNING, State.CONFIGURING):
                 self.message = self._advice()
 
-    def _advice(self) -> str:
-        """What is wrong while data flows: faults of the device, settings it did not take."""
+    def _faults(self) -> list[str]:
         faults = Status.decode(self.status_code).faults()
         if self.work_state == WorkState.ERROR:
             faults.append("the device reports an error state")
-        faults += [
-            f"{a.item} = {a.requested} refused" for a in self.applied.values() if a.status == "refused"
-        ]
-        return f"Livox Avia {self.code}: {', '.join(faults)}" if faults else ""
+        return faults
 
     def _seen(self, item: str, read_back: str) -> None:
         """Settings without a read command show in other messages."""
@@ -364,10 +318,6 @@ class AviaSession:
             self.message = self._advice()
 
     # -- sending ------------------------------------------------------------------------------------------------
-
-    def _next_seq(self) -> int:
-        self._seq = (self._seq + 1) & 0xFFFF
-        return self._seq
 
     def _put(self, cmd: General | Lidar, payload: bytes = b"") -> int:
         seq = self._next_seq()

@@ -11,16 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from artemis_drivers._jit import njit
-from artemis_drivers.livox_bytes import f32_at, i32_at, u16_at, u32_at
-from artemis_drivers.livox_decoder import IMU, POINTS, LivoxDecoder, RawArrays
+from artemis_drivers.livox_bytes import i32_at, i64_at, u16_at, u32_at
+from artemis_drivers.livox_decoder import IMU, IMU_PERIOD_NS, POINTS, LivoxDecoder, Streams, put_imu
 from artemis_drivers.livox_slots import (
     CLOCK_GPS,
     CLOCK_NONE,
     CLOCK_PPS,
     CLOCK_PTP,
     DUPLICATE,
-    STANDARD_GRAVITY,
-    ImuArrays,
     PointArrays,
     days_of,
     track,
@@ -33,7 +31,6 @@ HEADER_BYTES = 18
 SHOT_NS = 1e9 / 240_000
 LINES = 6
 IMU_TYPE = 6
-IMU_PERIOD_NS = 5_000_000
 
 # per data type 0..8: shots a packet, returns a shot, bytes a shot (0: not known here); 3, 5, 8 are spherical
 SHOTS = np.array([0, 0, 96, 96, 48, 48, 1, 30, 30], np.int64)
@@ -50,19 +47,7 @@ class Decoder(LivoxDecoder):
         self._anchor = np.zeros(3, np.int64)
 
     def _run(self, first: int, count: int, point_at: int, imu_at: int) -> tuple[int, int]:
-        made: tuple[int, int] = decode_packets(
-            self.raw,
-            first,
-            count,
-            self.point_fields,
-            point_at,
-            self.imu_fields,
-            imu_at,
-            self.tracks,
-            self.bad,
-            self.last,
-            self._anchor,
-        )
+        made: tuple[int, int] = decode_packets(self.streams, first, count, point_at, imu_at, self._anchor)
         return made
 
 
@@ -80,7 +65,7 @@ def packet_time(b: NDArray[np.uint8], rx: int, anchor: NDArray[np.int64]) -> int
         if days < 0 or b[13] > 23 or microseconds >= 3_600_000_000:
             return -1
         return int(((days * 24 + np.int64(b[13])) * 3_600_000_000 + microseconds) * 1000)
-    time = int(u32_at(b, 10) | u32_at(b, 14) << 32)
+    time = int(i64_at(b, 10))
     if time < 0 or kind not in (CLOCK_NONE, CLOCK_PTP, CLOCK_PPS):
         return -1
     if kind == CLOCK_PPS:
@@ -151,41 +136,33 @@ def _sound(b: NDArray[np.uint8], size: int, bad: NDArray[np.void]) -> bool:
 
 @njit
 def decode_packets(
-    raw: RawArrays,
-    first: int,
-    count: int,
-    points: PointArrays,
-    point_at: int,
-    imu: ImuArrays,
-    imu_at: int,
-    tracks: NDArray[np.void],
-    bad: NDArray[np.void],
-    last: NDArray[np.void],
-    anchor: NDArray[np.int64],
+    s: Streams, first: int, count: int, point_at: int, imu_at: int, anchor: NDArray[np.int64]
 ) -> tuple[int, int]:
     """Raw slots ``first..`` into point slots from ``point_at`` and IMU slots from ``imu_at``; how many of each."""
     n_points = n_imu = 0
     for number in range(first, first + count):
-        row = number % raw.size.size
-        b, rx = raw.data[row], raw.rx_ns[row]
-        if not _sound(b, raw.size[row], bad):
+        row = number % s.raw.size.size
+        b, rx = s.raw.data[row], s.raw.rx_ns[row]
+        if not _sound(b, s.raw.size[row], s.bad):
             continue
         stamp = packet_time(b, rx, anchor)
         if stamp < 0:
-            bad[0].time += 1
+            s.bad[0].time += 1
             continue
         kind = np.int64(b[9])
         stream = IMU if kind == IMU_TYPE else POINTS
         period = IMU_PERIOD_NS if kind == IMU_TYPE else int(SHOTS[kind] * SHOT_NS)
-        if track(tracks, stream, stamp, np.int64(b[8]), rx, period) == DUPLICATE:
+        if track(s.tracks, stream, stamp, np.int64(b[8]), rx, period) == DUPLICATE:
             continue
-        last[0].status, last[0].clock = u32_at(b, 4), b[8]
+        s.last[0].status, s.last[0].clock = u32_at(b, 4), b[8]
         if kind == IMU_TYPE:
-            _put_imu(b, stamp, rx, number, imu, (imu_at + n_imu) % imu.stamp_ns.size)
+            at = (imu_at + n_imu) % s.imu.stamp_ns.size
+            put_imu(b, HEADER_BYTES, stamp, rx, b[8], number, s.imu, at)
             n_imu += 1
         else:
-            last[0].data_type = kind
-            _put_points(b, stamp, rx, number, points, (point_at + n_points) % points.stamp_ns.size)
+            s.last[0].data_type = kind
+            at = (point_at + n_points) % s.points.stamp_ns.size
+            _put_points(b, stamp, rx, number, s.points, at)
             n_points += 1
     return n_points, n_imu
 
@@ -202,11 +179,3 @@ def _put_points(b: NDArray[np.uint8], stamp: int, rx: int, number: int, p: Point
         _spherical(b, shots, returns, p.xyz[at], p.reflectivity[at], p.tag[at])
     else:
         _cartesian(b, shots * returns, p.xyz[at], p.reflectivity[at], p.tag[at])
-
-
-@njit
-def _put_imu(b: NDArray[np.uint8], stamp: int, rx: int, number: int, imu: ImuArrays, at: int) -> None:
-    imu.stamp_ns[at], imu.rx_ns[at], imu.packet[at], imu.clock[at] = stamp, rx, number, b[8]
-    for k in range(3):
-        imu.gyro[at, k] = f32_at(b, HEADER_BYTES + 4 * k)
-        imu.accel[at, k] = f32_at(b, HEADER_BYTES + 12 + 4 * k) * STANDARD_GRAVITY

@@ -12,10 +12,10 @@ import struct
 import zlib
 from typing import NamedTuple
 
-START = 0xAA
+from artemis_drivers.livox_frames import MAX_FRAME, START, require_short, split
+
 VERSION = 1
 OVERHEAD = 15  # bytes of a frame without payload
-MAX_FRAME = 1400
 _HEADER = struct.Struct("<BBHBHHBB")
 _CRC16_START = 0x4C49  # register at the start, bits reflected
 _CRC32_SEED = 0x564F580A
@@ -133,8 +133,7 @@ def crc32(data: bytes) -> int:
 def encode(frame: Frame) -> bytes:
     """Frame as bytes with both checksums. Raises ValueError when the payload is too long."""
     length = OVERHEAD + len(frame.payload)
-    if length > MAX_FRAME:
-        raise ValueError(f"a control frame has at most {MAX_FRAME} bytes, not {length}")
+    require_short(length)
     head = struct.pack("<BBHBH", START, VERSION, length, frame.kind, frame.seq)
     body = head + struct.pack("<HBB", crc16(head), frame.cmd_set, frame.cmd_id) + frame.payload
     return body + struct.pack("<I", crc32(body))
@@ -142,20 +141,10 @@ def encode(frame: Frame) -> bytes:
 
 def decode(datagram: bytes) -> tuple[list[Frame], int]:
     """All frames of a datagram (devices may pack several into one), and how many bytes were not understood."""
-    frames = []
-    at = skipped = 0
-    while len(datagram) - at >= OVERHEAD:
-        frame = _frame_at(datagram, at)
-        if frame is None:
-            at += 1
-            skipped += 1
-        else:
-            frames.append(frame)
-            at += OVERHEAD + len(frame.payload)
-    return frames, skipped + len(datagram) - at
+    return split(datagram, OVERHEAD, _frame_at)
 
 
-def _frame_at(data: bytes, at: int) -> Frame | None:
+def _frame_at(data: bytes, at: int) -> tuple[Frame, int] | None:
     start, version, length, kind, seq, _, cmd_set, cmd_id = _HEADER.unpack_from(data, at)
     if start != START or version != VERSION or not OVERHEAD <= length <= min(MAX_FRAME, len(data) - at):
         return None
@@ -164,4 +153,4 @@ def _frame_at(data: bytes, at: int) -> Frame | None:
     end = at + length
     if crc32(data[at : end - 4]) != int.from_bytes(data[end - 4 : end], "little"):
         return None
-    return Frame(kind, seq, cmd_set, cmd_id, data[at + 11 : end - 4])
+    return Frame(kind, seq, cmd_set, cmd_id, data[at + 11 : end - 4]), length

@@ -1,19 +1,17 @@
 """Session with one Mid-360: it is found by a search, told where to send, and asked every second how it is.
 
 The protocol knows no handshake and no heartbeat. Where data go, what is sent and the work mode are values under
-keys, set and read back one by one. Without input or output of its own, like AviaSession.
+keys, set and read back one by one.
 """
 
 from __future__ import annotations
 
-import ipaddress
 import struct
-from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
 from artemis_drivers.base import Applied, State
-from artemis_drivers.livox_dialogue import MS, Ask, Datagram, Dialogue, Script
+from artemis_drivers.livox_dialogue import MS, Ask, Datagram, Script
 from artemis_drivers.livox_mid360.protocol import (
     DEVICE_NAMES,
     DISCOVERY_PORT,
@@ -35,12 +33,10 @@ from artemis_drivers.livox_mid360.protocol import (
     encode_values,
 )
 from artemis_drivers.livox_mid360.settings import PATTERNS, POINT_TYPES, Mid360Config
-from artemis_drivers.udp import Interface, address_facing, interfaces
+from artemis_drivers.livox_session import LOST_NS, UNHEARD_NS, LivoxSession
+from artemis_drivers.udp import Interface, interfaces
 
 POLL_NS = 1000 * MS
-LOST_NS = 3000 * MS
-SILENT_NS = 600 * MS
-UNHEARD_NS = 5000 * MS
 _TIME_OF_PULSE = 2  # type byte of command TIME: the pulse just passed has this time
 _SYNC_NAMES = ("none", "ptp", "gps")
 
@@ -54,34 +50,23 @@ class Setting(NamedTuple):
     value: bytes
 
 
-class Mid360Session:
+class Mid360Session(LivoxSession):
     """State of one Mid-360 as the host sees it."""
+
+    model = "Mid-360"
+    seq_mask = 0xFFFFFFFF
 
     def __init__(
         self, config: Mid360Config, own_addresses: Callable[[], list[Interface]] = interfaces
     ) -> None:
+        super().__init__(config.host_ip, own_addresses)
         self.config = config
-        self.state = State.STOPPED
-        self.message = ""
-        self.outbox: list[Datagram] = []
-        self.counters: Counter[str] = Counter()
-        self.applied: dict[str, Applied] = {}
-        self.serial = self.device_ip = self.firmware = ""
         self.work_state = 0
         self.time_sync = 0
-        self._own_addresses = own_addresses
-        self._dialogue = Dialogue(self._put_ask, self._next_seq)
-        self._seq = self._command_port = 0
+        self._command_port = self._polled = 0
         self._time_seq = -1
-        self._leaving = False
-        self._began = self._polled = self._heard = self._last_data = self._running_since = 0
 
     # -- what the host calls ------------------------------------------------------------------------------------
-
-    def start(self, now: int) -> None:
-        """Begin to search for the device."""
-        self._leaving = False
-        self._search("", now)
 
     def begin_stop(self, now: int) -> None:
         """Put the device to idle; ``state`` is STOPPED when that is done or was not answered."""
@@ -128,12 +113,6 @@ class Mid360Session:
             elif frame.is_answer:
                 self._hear_answer(frame, now)
 
-    def data_seen(self, now: int, data_type: int, status_code: int) -> None:
-        """Data packets have arrived."""
-        self._last_data = now
-        if self.state == State.SILENT:
-            self.state, self.message = State.RUNNING, self._advice()
-
     def send_utc(self, unix_ns: int) -> None:
         """Name the PPS edge just passed."""
         if not self.device_ip:
@@ -159,16 +138,9 @@ class Mid360Session:
                 Ask(Cmd.GET, encode_keys([Key.WORK_STATE, Key.TIME_SYNC, Key.FIRMWARE])), self._next_seq()
             )
         if now - max(self._heard, self._last_data) > LOST_NS:
-            self.counters["device_lost"] += 1
-            self._search(
-                f"the Livox Mid-360 {self.serial} does not answer any more: check its power and cable", now
-            )
+            self._search(self._gone(), now)
         else:
             self._watch_data(now)
-
-    def identity(self) -> dict[str, str]:
-        """Serial number, address, firmware."""
-        return {"serial": self.serial, "address": self.device_ip, "firmware": self.firmware}
 
     def status(self) -> dict[str, str]:
         """The device's own status in words."""
@@ -176,39 +148,17 @@ class Mid360Session:
         sync = _SYNC_NAMES[self.time_sync] if self.time_sync < len(_SYNC_NAMES) else "unknown"
         return {"work_state": Work(self.work_state).name.lower() if known else "unknown", "sync": sync}
 
-    def resent(self) -> int:
-        """Commands that had to be repeated."""
-        return self._dialogue.resent
-
-    # -- finding and losing the device --------------------------------------------------------------------------
-
-    def _search(self, message: str, now: int) -> None:
-        self._dialogue.cancel()
-        self.state, self.message, self._began = State.SEARCHING, message, now
+    # -- finding the device -------------------------------------------------------------------------------------
 
     def _connect(self, found: Found, ip: str, now: int) -> None:
-        host = self.config.host_ip or address_facing(ip, self._own_addresses())
+        host = self._host_facing(found.serial, ip)
         if host is None:
-            network = ipaddress.IPv4Network(f"{ip}/24", strict=False)
-            self.message = (
-                f"the Livox Mid-360 {found.serial} is heard at {ip}, but this computer has no address in its "
-                f"network: give the network port one, such as {network[50]}/24"
-            )
             return
         self.serial, self.device_ip, self._command_port = found.serial, ip, found.command_port
         self._heard = now
         self.state, self.message = State.CONFIGURING, ""
         self.counters["sessions"] += 1
         self._dialogue.start(self._configuration(host), now)
-
-    def _watch_data(self, now: int) -> None:
-        quiet = now - max(self._last_data, self._running_since)
-        if quiet > SILENT_NS and self.state == State.RUNNING:
-            self.counters["silences"] += 1
-            self.state = State.SILENT
-        if self.state == State.SILENT:
-            missing = f"no data from the Livox Mid-360 {self.serial} for {quiet / 1e9:.1f} s"
-            self.message = f"{missing}: check its cable and power"
 
     # -- what is said -------------------------------------------------------------------------------------------
 
@@ -269,7 +219,7 @@ class Mid360Session:
     def _hear_answer(self, frame: Frame, now: int) -> None:
         self._heard = now
         if frame.cmd == Cmd.TIME and frame.seq == self._time_seq:
-            self.counters["utc_accepted" if frame.data[:1] == b"\0" else "utc_refused"] += 1
+            self._count_utc(frame.data)
         elif not self._dialogue.answer(frame.seq, frame.cmd, frame.data, now):
             self._read(decode_got(frame.data) or {} if frame.cmd == Cmd.GET else {})
 
@@ -283,18 +233,10 @@ class Mid360Session:
         if self.state == State.RUNNING:
             self.message = self._advice()
 
-    def _advice(self) -> str:
-        faults = ["the device reports an error state"] if self.work_state == Work.ERROR else []
-        faults += [
-            f"{a.item} = {a.requested} refused" for a in self.applied.values() if a.status == "refused"
-        ]
-        return f"Livox Mid-360 {self.serial}: {', '.join(faults)}" if faults else ""
+    def _faults(self) -> list[str]:
+        return ["the device reports an error state"] if self.work_state == Work.ERROR else []
 
     # -- sending ------------------------------------------------------------------------------------------------
-
-    def _next_seq(self) -> int:
-        self._seq = (self._seq + 1) & 0xFFFFFFFF
-        return self._seq
 
     def _put_ask(self, ask: Ask, seq: int) -> None:
         frame = Frame(seq, ask.command, is_answer=False, from_lidar=False, data=ask.payload)

@@ -13,20 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from artemis_drivers._jit import njit
-from artemis_drivers.livox_bytes import f32_at, i16_at, i32_at, u16_at, u32_at
-from artemis_drivers.livox_decoder import IMU, POINTS, LivoxDecoder, RawArrays
+from artemis_drivers.livox_bytes import i16_at, i32_at, i64_at, u16_at, u32_at
+from artemis_drivers.livox_decoder import IMU, IMU_PERIOD_NS, POINTS, LivoxDecoder, Streams, put_imu
 from artemis_drivers.livox_slots import (
     DUPLICATE,
     POINTS_PER_SLOT,
-    STANDARD_GRAVITY,
-    ImuArrays,
     PointArrays,
     track,
 )
 
 HEADER_BYTES = 36
 LINES = 4
-IMU_PERIOD_NS = 5_000_000
 POINT_BYTES = np.array([24, 14, 8, 10], np.int64)  # of data types 0 (IMU) to 3
 _CLOCKS = 3  # timestamp types 0 none, 1 PTP, 2 GPS
 _GPS = 2
@@ -36,18 +33,7 @@ class Decoder(LivoxDecoder):
     """Decodes the raw packets of one Mid-360."""
 
     def _run(self, first: int, count: int, point_at: int, imu_at: int) -> tuple[int, int]:
-        made: tuple[int, int] = decode_packets(
-            self.raw,
-            first,
-            count,
-            self.point_fields,
-            point_at,
-            self.imu_fields,
-            imu_at,
-            self.tracks,
-            self.bad,
-            self.last,
-        )
+        made: tuple[int, int] = decode_packets(self.streams, first, count, point_at, imu_at)
         return made
 
 
@@ -69,41 +55,32 @@ def _sound(b: NDArray[np.uint8], size: int, bad: NDArray[np.void]) -> bool:
 
 
 @njit
-def decode_packets(
-    raw: RawArrays,
-    first: int,
-    count: int,
-    points: PointArrays,
-    point_at: int,
-    imu: ImuArrays,
-    imu_at: int,
-    tracks: NDArray[np.void],
-    bad: NDArray[np.void],
-    last: NDArray[np.void],
-) -> tuple[int, int]:
+def decode_packets(s: Streams, first: int, count: int, point_at: int, imu_at: int) -> tuple[int, int]:
     """Raw slots ``first..`` into point slots from ``point_at`` and IMU slots from ``imu_at``; how many of each."""
     n_points = n_imu = 0
     for number in range(first, first + count):
-        row = number % raw.size.size
-        b, rx = raw.data[row], raw.rx_ns[row]
-        if not _sound(b, raw.size[row], bad):
+        row = number % s.raw.size.size
+        b, rx = s.raw.data[row], s.raw.rx_ns[row]
+        if not _sound(b, s.raw.size[row], s.bad):
             continue
-        stamp = int(u32_at(b, 28) | u32_at(b, 32) << 32)
+        stamp = int(i64_at(b, 28))
         if stamp < 0 or b[11] >= _CLOCKS:
-            bad[0].time += 1
+            s.bad[0].time += 1
             continue
         is_imu = b[10] == 0
         period = IMU_PERIOD_NS if is_imu else int(u16_at(b, 3)) * 100
         clock = 3 if b[11] == _GPS else np.int64(b[11])
-        if track(tracks, IMU if is_imu else POINTS, stamp, clock, rx, max(period, 1)) == DUPLICATE:
+        if track(s.tracks, IMU if is_imu else POINTS, stamp, clock, rx, max(period, 1)) == DUPLICATE:
             continue
-        last[0].clock = clock
+        s.last[0].clock = clock
         if is_imu:
-            _put_imu(b, stamp, rx, clock, number, imu, (imu_at + n_imu) % imu.stamp_ns.size)
+            at = (imu_at + n_imu) % s.imu.stamp_ns.size
+            put_imu(b, HEADER_BYTES, stamp, rx, clock, number, s.imu, at)
             n_imu += 1
         else:
-            last[0].data_type = b[10]
-            _put_points(b, stamp, rx, clock, number, points, (point_at + n_points) % points.stamp_ns.size)
+            s.last[0].data_type = b[10]
+            at = (point_at + n_points) % s.points.stamp_ns.size
+            _put_points(b, stamp, rx, clock, number, s.points, at)
             n_points += 1
     return n_points, n_imu
 
@@ -133,13 +110,3 @@ def _put_points(
             xyz[i, 1] = depth * np.sin(theta) * np.sin(phi)
             xyz[i, 2] = depth * np.cos(theta)
         p.reflectivity[at, i], p.tag[at, i] = b[o + step - 2], b[o + step - 1]
-
-
-@njit
-def _put_imu(
-    b: NDArray[np.uint8], stamp: int, rx: int, clock: int, number: int, imu: ImuArrays, at: int
-) -> None:
-    imu.stamp_ns[at], imu.rx_ns[at], imu.packet[at], imu.clock[at] = stamp, rx, number, clock
-    for k in range(3):
-        imu.gyro[at, k] = f32_at(b, HEADER_BYTES + 4 * k)
-        imu.accel[at, k] = f32_at(b, HEADER_BYTES + 12 + 4 * k) * STANDARD_GRAVITY

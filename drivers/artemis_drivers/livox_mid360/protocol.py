@@ -14,9 +14,9 @@ import struct
 import zlib
 from typing import NamedTuple
 
-START = 0xAA
+from artemis_drivers.livox_frames import MAX_FRAME, START, require_short, split
+
 HEADER_BYTES = 24
-MAX_FRAME = 1400
 _HEADER = struct.Struct("<BBHIHBB6xHI")
 
 DISCOVERY_PORT = 56000
@@ -81,8 +81,7 @@ class Frame(NamedTuple):
 def encode(frame: Frame) -> bytes:
     """Frame as bytes. Raises ValueError when the data is too long."""
     length = HEADER_BYTES + len(frame.data)
-    if length > MAX_FRAME:
-        raise ValueError(f"a control frame has at most {MAX_FRAME} bytes, not {length}")
+    require_short(length)
     head = struct.pack(
         "<BBHIHBB6x", START, 0, length, frame.seq, frame.cmd, frame.is_answer, frame.from_lidar
     )
@@ -92,20 +91,10 @@ def encode(frame: Frame) -> bytes:
 
 def decode(datagram: bytes) -> tuple[list[Frame], int]:
     """All frames of a datagram, and how many bytes were not understood."""
-    frames = []
-    at = skipped = 0
-    while len(datagram) - at >= HEADER_BYTES:
-        frame = _frame_at(datagram, at)
-        if frame is None:
-            at += 1
-            skipped += 1
-        else:
-            frames.append(frame)
-            at += HEADER_BYTES + len(frame.data)
-    return frames, skipped + len(datagram) - at
+    return split(datagram, HEADER_BYTES, _frame_at)
 
 
-def _frame_at(b: bytes, at: int) -> Frame | None:
+def _frame_at(b: bytes, at: int) -> tuple[Frame, int] | None:
     start, version, length, seq, cmd, kind, sender, crc16, crc32 = _HEADER.unpack_from(b, at)
     if start != START or version != 0 or not HEADER_BYTES <= length <= min(MAX_FRAME, len(b) - at):
         return None
@@ -114,7 +103,7 @@ def _frame_at(b: bytes, at: int) -> Frame | None:
     data = b[at + HEADER_BYTES : at + length]
     if crc32 != (zlib.crc32(data) if data else 0):
         return None
-    return Frame(seq, cmd, kind == 1, sender == 1, data)
+    return Frame(seq, cmd, kind == 1, sender == 1, data), length
 
 
 def encode_values(values: dict[int, bytes]) -> bytes:
