@@ -27,7 +27,7 @@ from artemis_edge.session import simulate as sim
 from artemis_edge.session import true_views, truth, winding
 from artemis_edge.session.messages import CameraExposure, CompressedImage, Image, Imu, PointCloud2, TFMessage
 from artemis_edge.session.recording import record
-from artemis_edge.session.rig import START_NS, build_rig, read_settings
+from artemis_edge.session.rig import START_NS, Settings, build_rig, read_settings
 from artemis_edge.session.truth_files import POINT_TRUTH, POINTS_TOPIC
 from artemis_edge.session.writer import POINT
 from artemis_edge.trajectory import interpolate, inverse, read_tum
@@ -357,6 +357,12 @@ def test_mistakes_are_told_in_one_sentence(
     assert message in str(told.value)
     assert "\n" not in str(told.value)
     assert not (tmp_path / "s").exists()
+
+
+def test_every_setting_is_documented() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "virtual-rig.md").read_text()
+    for name in Settings.__struct_fields__:
+        assert f"`{name}`" in page, name
 
 
 # --- truth.py, winding.py, by_class.py
