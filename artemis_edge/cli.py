@@ -39,7 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ending.code if isinstance(ending.code, int) else BAD_USE
     except UserError as error:
         return _tell(str(error), error.exit_code)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not _interrupted(error):
+            raise
         return _tell("interrupted; complete results are kept, nothing half-written is left", FELL_SHORT)
     except BrokenPipeError:
         # Whoever read our output has left; Python must not try to flush it again at exit.
@@ -51,6 +53,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     except OSError as error:
         return _tell(_os_sentence(error), FELL_SHORT)
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether an interrupt is behind it: inside a compiled kernel Python wraps it in a SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _tell(sentence: str, code: int) -> int:

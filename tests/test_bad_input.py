@@ -114,6 +114,15 @@ def test_poses_that_do_not_cover_the_frames(
     assert not (tmp_path / "out").exists()
 
 
+def test_poses_in_national_coordinates(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = tmp_path / "utm.tum"
+    poses.write_text("".join(f"{0.1 * k:.6f} 450000 {5e6 + 0.5 * k} 0 0 0 0 1\n" for k in range(10)))
+    assert main(["reprocess", str(kitti), "--out", str(tmp_path / "out"), "--poses", str(poses)]) == 2
+    assert "subtract one offset" in capsys.readouterr().err
+
+
 def test_poses_that_are_not_there(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ("reprocess", kitti, "--poses", tmp_path / "no.tum", "--out", tmp_path / "out")
     assert "cannot read the poses" in refused(capsys, 2, *arguments)

@@ -92,6 +92,29 @@ def test_failures_of_the_machine_are_one_sentence(
     assert told.out == ""
 
 
+def _system_error(cause: BaseException | None) -> SystemError:
+    error = SystemError("kernel returned a result with an exception set")
+    error.__cause__ = cause
+    return error
+
+
+def test_an_interrupt_inside_a_kernel_is_an_interrupt(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raised = _system_error(None)
+
+    def fail(*_: object) -> None:
+        raise raised
+
+    monkeypatch.setattr("artemis_edge.session.catalog.catalog", fail)
+    raised = _system_error(_system_error(KeyboardInterrupt()))
+    assert main(["session", "info", "x"]) == 1
+    assert "interrupted" in capsys.readouterr().err
+    raised = _system_error(ValueError("a fault of ours"))
+    with pytest.raises(SystemError):
+        main(["session", "info", "x"])
+
+
 def test_reader_that_leaves_ends_quietly(kitti: Path) -> None:
     command = [sys.executable, "-m", "artemis_edge.cli", "session", "info", str(kitti)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:

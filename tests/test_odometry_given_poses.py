@@ -69,6 +69,17 @@ def test_bad_trajectories_are_refused():
             GivenPoses(trajectory)
 
 
+@pytest.mark.parametrize(("far_m", "fits"), [(99_999.0, True), (-100_001.0, False), (5e6, False)])
+def test_poses_far_from_the_origin_are_refused(far_m, fits):
+    poses = np.stack([START, START])
+    poses[1, 1, 3] = far_m
+    if fits:
+        assert GivenPoses(Trajectory(STAMPS[:2], poses)).at(int(STAMPS[1]))[0][1, 3] == far_m
+    else:
+        with pytest.raises(InputError, match=f"reach {abs(far_m) / 1000:.6g} km .* subtract one offset"):
+            GivenPoses(Trajectory(STAMPS[:2], poses))
+
+
 def shaken(t):
     """A pose of a hand that turns, T_world_lidar (4, 4)."""
     turn = 0.3 * np.sin(9.0 * t)

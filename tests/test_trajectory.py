@@ -70,6 +70,8 @@ def test_comments_blank_lines_and_exponents(tmp_path: Path) -> None:
         ("1 nan 2 3 0 0 0 1\n", "not finite"),
         ("nan 1 2 3 0 0 0 1\n", "not finite"),
         ("1 1 2 inf 0 0 0 1\n", "not finite"),
+        ("1 1 2 1e300 0 0 0 1\n", "line 1 .* beyond 100,000 km"),
+        ("1 -1.1e8 2 3 0 0 0 1\n", "beyond 100,000 km"),
         ("1 1 2 3 0 0 0 0\n", "unit length"),
         ("1 1 2 3 4 5 6 7\n", "unit length"),
         ("1e300 1 2 3 0 0 0 1\n", "not in seconds"),

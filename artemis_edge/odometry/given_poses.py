@@ -15,6 +15,8 @@ from artemis_edge.trajectory import interpolate
 _PAIRING_NS = 10_000_000
 # Poses in a scan, for each piece of its motion, from which on they tell it better than anything between them
 _DENSE = 0.5
+# Vertices are float32: 8 mm apart at this distance from the origin, 0.5 m apart at UTM's northings
+_FARTHEST_M = 100_000.0
 
 
 class GivenPoses:
@@ -22,7 +24,8 @@ class GivenPoses:
 
     The motion within a scan follows the poses themselves where they are denser than the scans, else the
     gyroscope between them, else the twist and its change between the neighbouring poses; with a single pose it
-    is none. Raises InputError if the poses are unordered or do not cover a frame.
+    is none. Raises InputError if the poses are unordered, do not cover a frame or lie more than 100 km from the
+    origin.
     """
 
     def __init__(self, trajectory: Trajectory) -> None:
@@ -34,6 +37,12 @@ class GivenPoses:
             )
         if poses.shape != (len(stamps), 4, 4) or not np.isfinite(poses).all():
             raise InputError("the given poses are not finite 4 x 4 matrices, one a stamp; mend the pose file")
+        farthest = float(np.abs(poses[:, :3, 3]).max())
+        if farthest > _FARTHEST_M:
+            raise InputError(
+                f"the given poses reach {farthest / 1000:.6g} km from the origin; subtract one offset from all of "
+                f"them: float32 vertices and block keys serve a map within {_FARTHEST_M / 1000:.0f} km"
+            )
         if (np.diff(stamps) <= 0).any():
             raise InputError("the stamps of the given poses do not ascend; sort the pose file by time")
         self._stamps = stamps
