@@ -139,30 +139,31 @@ def decode_packets(
     s: Streams, first: int, count: int, point_at: int, imu_at: int, anchor: NDArray[np.int64]
 ) -> tuple[int, int]:
     """Raw slots ``first..`` into point slots from ``point_at`` and IMU slots from ``imu_at``; how many of each."""
+    raw, points, imu, tracks, bad, last = s  # a field read in the loop would count references: a third slower
     n_points = n_imu = 0
     for number in range(first, first + count):
-        row = number % s.raw.size.size
-        b, rx = s.raw.data[row], s.raw.rx_ns[row]
-        if not _sound(b, s.raw.size[row], s.bad):
+        row = number % raw.size.size
+        b, rx = raw.data[row], raw.rx_ns[row]
+        if not _sound(b, raw.size[row], bad):
             continue
         stamp = packet_time(b, rx, anchor)
         if stamp < 0:
-            s.bad[0].time += 1
+            bad[0].time += 1
             continue
         kind = np.int64(b[9])
         stream = IMU if kind == IMU_TYPE else POINTS
         period = IMU_PERIOD_NS if kind == IMU_TYPE else int(SHOTS[kind] * SHOT_NS)
-        if track(s.tracks, stream, stamp, np.int64(b[8]), rx, period) == DUPLICATE:
+        if track(tracks, stream, stamp, np.int64(b[8]), rx, period) == DUPLICATE:
             continue
-        s.last[0].status, s.last[0].clock = u32_at(b, 4), b[8]
+        last[0].status, last[0].clock = u32_at(b, 4), b[8]
         if kind == IMU_TYPE:
-            at = (imu_at + n_imu) % s.imu.stamp_ns.size
-            put_imu(b, HEADER_BYTES, stamp, rx, b[8], number, s.imu, at)
+            at = (imu_at + n_imu) % imu.stamp_ns.size
+            put_imu(b, HEADER_BYTES, stamp, rx, b[8], number, imu, at)
             n_imu += 1
         else:
-            s.last[0].data_type = kind
-            at = (point_at + n_points) % s.points.stamp_ns.size
-            _put_points(b, stamp, rx, number, s.points, at)
+            last[0].data_type = kind
+            at = (point_at + n_points) % points.stamp_ns.size
+            _put_points(b, stamp, rx, number, points, at)
             n_points += 1
     return n_points, n_imu
 
