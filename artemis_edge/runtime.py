@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -78,8 +78,8 @@ def reprocess(
 ) -> Outcome:
     """Map an input into ``request.out``.
 
-    Raises InputError when nothing can be done, RunError when the run ended early or a result could not be
-    written; its sentence says what was kept.
+    Raises InputError when nothing can be done, RunError when the run ended early, a result could not be written
+    or the mesh has no triangle; its sentence says what was kept.
     """
     health.restart_peak()
     source = open_input(request.input, request.config.input)
@@ -102,6 +102,8 @@ def reprocess(
         results = Results(request.out)
         outcome = _write(results, run, mapper, photos, statistics, evaluate)
     _complain(run, results, request.out)
+    if outcome is not None and not outcome["triangles"]:
+        raise _nothing_meshed(outcome, request, results)
     warnings = [*source.warnings, *_skipped(run, statistics)]
     return Outcome(request.out, outcome or {}, statistics, run.trajectory(), warnings)
 
@@ -176,6 +178,7 @@ def _write(
     results.attempt("trajectory.tum", lambda path: _write_tum(path, trajectory))
     results.text("config.toml", statistics.config_toml)
     results.json("objects.json", {"objects": []})
+    photos.remove_earlier()
     if photos.every:
         lost = results.attempt(INDEX, lambda path: photos.write_index(path, trajectory))
         statistics.add_lost({"photos_without_pose": lost} if lost else {})
@@ -186,7 +189,7 @@ def _write(
     whole = mesh
     results.attempt("mesh.glb", lambda path: write_glb(path, whole))
     statistics.peak_rss_mb = health.peak_resident_mb() or None
-    evaluation = evaluate(whole, trajectory) if evaluate is not None else None
+    evaluation = evaluate(whole, trajectory) if evaluate is not None and len(whole.faces) else None
     return results.attempt(
         "report.html",
         lambda path: write_report(path.parent, whole, trajectory, statistics, (), evaluation),
@@ -207,6 +210,17 @@ def _nothing_mapped(run: MappingRun, source: FrameSource, span: range) -> InputE
         return RunError(f"{run.stopped}; nothing was mapped")
     why = f": {run.fault}" if run.fault is not None else ""
     return InputError(f"none of the {len(span)} frames of {source.name} could be mapped{why}")
+
+
+def _nothing_meshed(report: Mapping[str, Any], request: Request, results: Results) -> RunError:
+    lost = ", ".join(f"{count} {reason}" for reason, count in report["lost"].items()) or "nothing"
+    rules = request.config.voxel_map
+    return RunError(
+        f"the mesh of {report['frames']} frames has no triangles (counted as not used: {lost}); see whether the "
+        f"scans hold points between voxel_map.min_range_m = {rules.min_range_m:g} and "
+        f"voxel_map.max_range_m = {rules.max_range_m:g}, whether their poses are right and whether more than a few "
+        f"frames were asked for; kept in {request.out}: {', '.join(results.kept)}"
+    )
 
 
 def _complain(run: MappingRun, results: Results, out: Path) -> None:

@@ -17,6 +17,7 @@ from artemis_edge.cli import main
 from artemis_edge.config import Config
 from artemis_edge.datasets import open_input
 from artemis_edge.errors import InputError, RunError
+from artemis_edge.export.ply import Mesh, bare_mesh, write_ply
 from artemis_edge.frames import CameraImage, CameraModel, SyncedFrame, Trajectory
 from artemis_edge.runtime import Request, reprocess
 from artemis_edge.session.photos import HeldOut
@@ -116,6 +117,27 @@ def test_a_frame_that_cannot_be_mapped_is_counted(
     assert outcome.report["frames_dropped"] == 2
     assert outcome.report["lost"]["frames_skipped"] == 2
     assert outcome.warnings == ["2 frames were skipped; the first: no"]
+
+
+def test_a_mesh_without_triangles_is_a_failed_run(
+    kitti: Path, fake_pipeline: list[Any], tmp_path: Path
+) -> None:
+    from artemis_edge.pipeline import Pipeline
+
+    def nothing(path: Path) -> Mesh:
+        mesh = bare_mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
+        write_ply(path, mesh)
+        return mesh
+
+    def make(config: Config, odometry: Any, folder: Path) -> Any:
+        mapper: Any = Pipeline(config, odometry, folder)
+        mapper.write_mesh = nothing
+        return mapper
+
+    request = Request(kitti, tmp_path / "out", poses=poses_of(kitti))
+    with pytest.raises(RunError, match=r"10 frames has no triangles .*nothing.*max_range_m = 60.*kept in"):
+        reprocess(request, evaluate=lambda mesh, path: pytest.fail("there is nothing to evaluate"), make=make)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == CONTRACT
 
 
 def test_nothing_mapped_is_an_error_of_the_input(
@@ -253,6 +275,32 @@ def test_photographs_held_out_have_poses(tmp_path: Path) -> None:
     assert (tmp_path / photos[0]["file"]).read_bytes() == b"\x89PNG1"
     assert photos[0]["T_cam_world"][0][3] == pytest.approx(0.25 - 1.5)
     assert photos[0]["distortion"] == [0.0] * 5
+
+
+def test_photographs_of_an_earlier_run_are_removed(
+    kitti: Path, fake_pipeline: list[Any], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    (out / "photos").mkdir(parents=True)
+    for name in ("PHOTOS.json", "photos/cam_000002.png", "photos/holiday.jpg"):
+        (out / name).write_bytes(b"{}")
+    reprocess(Request(kitti, out, poses=poses_of(kitti)))
+    assert not (out / "PHOTOS.json").exists()
+    assert [path.name for path in (out / "photos").iterdir()] == ["holiday.jpg"]
+    (out / "photos" / "cam_000002.png").write_bytes(b"without an index, not ours")
+    reprocess(Request(kitti, out, poses=poses_of(kitti)))
+    assert (out / "photos" / "cam_000002.png").exists()
+
+
+def test_photographs_of_this_run_stay(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "PHOTOS.json").write_text("{}")
+    (tmp_path / "photos" / "cam_000007.jpg").write_bytes(b"old")
+    held = HeldOut(tmp_path, 1)
+    image = CameraImage("cam", 0, b"new", CameraModel(8, 6, 5.0, 5.0, 3.5, 2.5), np.eye(4))
+    held.take(SyncedFrame(0, 0, (), (image,)))
+    held.remove_earlier()
+    assert [path.name for path in (tmp_path / "photos").iterdir()] == ["cam_000001.jpg"]
 
 
 def test_photographs_beyond_the_trajectory_are_counted(tmp_path: Path) -> None:

@@ -94,7 +94,10 @@ class RosbagSource:
         return len(self._plans)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[SyncedFrame]:
-        """Frames ``start <= index < stop`` in order of time, decoded one by one."""
+        """Frames ``start <= index < stop`` in order of time, decoded one by one.
+
+        Raises InputError at a frame that has clouds of which none can be decoded.
+        """
         for index in range(*slice(start, stop).indices(len(self))):
             yield self._frame(index)
 
@@ -118,11 +121,14 @@ class RosbagSource:
 
     def _frame(self, index: int) -> SyncedFrame:
         plan, lost = self._plans[index], dict[str, int]()
-        scans, images = [], []
+        scans, images, damaged = [], [], 0
         for lidar, k in plan.clouds:
             try:
                 scan = _scan(self._lidars[lidar], k, lost)
-            except CdrError:
+            except CdrError as error:
+                damaged += 1
+                if damaged == len(plan.clouds):
+                    raise InputError(f"frame {index} of {self.name} cannot be decoded: {error}") from None
                 add_counts(lost, {"undecodable_clouds": 1})
                 continue
             if len(scan.points):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +17,8 @@ from artemis_edge.trajectory import covered, interpolate, inverse
 
 INDEX = "PHOTOS.json"
 FOLDER = "photos"
+# The names that ``HeldOut`` gives: camera and number.
+_NAMED = re.compile(r".+_\d{6,}\.(png|jpg)")
 _PNG_MAGIC = b"\x89PNG"
 
 
@@ -56,6 +59,22 @@ class HeldOut:
         write_bytes(self.out / file, image.encoded)
         self._photos.append(_Photo(file, replace(image, encoded=b"")))
         return True
+
+    def remove_earlier(self) -> None:
+        """Remove what an earlier run held out there: its index, and its photographs that are not this run's.
+
+        Nothing is touched where there is no index, and no file that another program named.
+        """
+        if not (self.out / INDEX).is_file():
+            return
+        ours = {self.out / photo.file for photo in self._photos}
+        folder = self.out / FOLDER
+        for file in list(folder.iterdir()) if folder.is_dir() else []:
+            if file not in ours and _NAMED.fullmatch(file.name) and file.is_file():
+                file.unlink()
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+        (self.out / INDEX).unlink()
 
     def write_index(self, path: Path, trajectory: Trajectory) -> int:
         """Write PHOTOS.json; returns how many photographs have no pose and are not in it.
