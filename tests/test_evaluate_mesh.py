@@ -147,10 +147,40 @@ def test_not_finite_is_counted() -> None:
     assert result.area_m2 == pytest.approx(0.75)
 
 
-@pytest.mark.parametrize("thresholds", [[], [0.0], [-1.0], [float("nan")]])
+@pytest.mark.parametrize("thresholds", [[], [0.0], [-1.0], [float("nan")], [1e300], [1e-9], [0.1, 101.0]])
 def test_bad_threshold(thresholds: list[float]) -> None:
     with pytest.raises(InputError, match="threshold"):
         evaluate_mesh(plane(), grid_cloud(1, 1, 0), thresholds)
+
+
+@pytest.mark.parametrize("tau", [0.001, 100.0])
+def test_thresholds_at_their_limits(tau: float) -> None:
+    mesh = plane(1, 1, 0.05)
+    found = evaluate_mesh(mesh, grid_cloud(0.05, 0.05, 0.0, 0.01), [tau])
+    assert found.comparisons[0].recall == 1.0
+
+
+def huge_triangle(at: float) -> Mesh:
+    """A good square beside a triangle of 100 km."""
+    good, far = plane(), np.array([[at, 0, 0], [at + 1e5, 0, 0], [at, 1e5, 0]], np.float32)
+    faces = np.concatenate([good.faces, np.arange(3, dtype=np.int32)[None] + len(good.vertices)])
+    return bare_mesh(np.concatenate([good.vertices, far]), faces)
+
+
+def test_a_huge_triangle_is_cropped_before_it_is_sampled() -> None:
+    cloud = grid_cloud(1.0, 1.0, 0.0)
+    assert evaluate_mesh(huge_triangle(50.0), cloud, [0.1], crop=True).comparisons[0].f1 == 1.0
+    for at, crop in ((50.0, False), (0.5, True)):
+        with pytest.raises(InputError, match=r"5e\+09 m2 of mesh need 5e\+12 samples, more than 1e\+09"):
+            evaluate_mesh(huge_triangle(at), cloud, [0.1], crop=crop)
+
+
+def test_vertices_beyond_any_scene() -> None:
+    astray = bare_mesh(np.float32([[0, 0, 0], [1e30, 0, 0], [0, 1e30, 0]]), np.int32([[0, 1, 2]]))
+    with pytest.raises(InputError, match="samples"):
+        evaluate_mesh(astray, grid_cloud(1, 1, 0), [0.1])
+    with pytest.raises(InputError, match="shift both clouds"):
+        evaluate_mesh(plane(), np.float32([[0, 0, 0], [1e30, 0, 0]]), [0.1])
 
 
 def test_nothing_to_compare() -> None:

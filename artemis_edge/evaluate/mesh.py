@@ -29,6 +29,8 @@ from artemis_edge.export.ply import Mesh, read_mesh, read_points
 from artemis_edge.frames import F32, F64, I32
 
 DEFAULT_THRESHOLDS = (0.1,)
+# Thresholds [m]: below a LiDAR's ranging noise and beyond a scene they measure nothing.
+_FINEST_TAU_M, _COARSEST_TAU_M = 0.001, 100.0
 _SAMPLES_PER_TAU2 = 10.0
 _WORKERS = 2
 _CM = 100.0
@@ -113,15 +115,19 @@ def evaluate_mesh(
     """Compare ``mesh`` with ``reference`` points float32 (n, 3) in the same frame at each threshold (m).
 
     ``crop`` leaves out samples outside the reference's bounding box + tau. Raises InputError when the
-    reference or the (cropped) mesh is empty or a threshold is not positive.
+    reference or the (cropped) mesh is empty, a threshold is not within 1 mm and 100 m, or the mesh is so large
+    for it that sampling would take hours.
     """
     good_point = finite_rows(reference)
     good_face = finite_rows(mesh.vertices)[mesh.faces].all(axis=1)
     reference, faces = reference[good_point], mesh.faces[good_face]
     if len(reference) == 0:
         raise InputError("the reference cloud has no points; give a cloud of the same scene")
-    if not thresholds or any(not 0.0 < tau < np.inf for tau in thresholds):
-        raise InputError("a threshold must be a positive length in metres, for example --threshold 0.1")
+    if not thresholds or any(not _FINEST_TAU_M <= tau <= _COARSEST_TAU_M for tau in thresholds):
+        raise InputError(
+            f"a threshold must be a length from {_FINEST_TAU_M:g} to {_COARSEST_TAU_M:g} metres, "
+            "for example --threshold 0.1"
+        )
     return MeshEvaluation(
         comparisons=tuple(_compare(mesh.vertices, faces, reference, tau, crop) for tau in thresholds),
         topology=topology(mesh.vertices, faces),

@@ -15,6 +15,8 @@ from artemis_edge.frames import F32, F64, I32, I64
 _PLASTIC = 1.32471795724474602596
 _STEP_U, _STEP_V = 1.0 / _PLASTIC, 1.0 / _PLASTIC**2
 _SAMPLES_AT_ONCE = 1 << 22
+# Some minutes of sampling: 100,000 m2 at a tau of 3.2 cm. More is a triangle gone astray or a tau too fine.
+MOST_SAMPLES = 1_000_000_000
 _CELL_BITS = 21
 
 
@@ -29,10 +31,15 @@ def samples(vertices: F32, faces: I32, per_m2: float) -> Iterator[F32]:
     """Points on the surface, ``per_m2`` a square metre, in chunks float32 (n, 3) in order of triangles.
 
     Systematic by area: sample k lies where the running area reaches k + 1/2 shares, so every patch gets its
-    share to within one sample.
+    share to within one sample. Raises InputError for more than ``MOST_SAMPLES``.
     """
     ends = np.cumsum(triangle_areas(vertices, faces))
     total = float(ends[-1]) if len(ends) else 0.0
+    if total * per_m2 > MOST_SAMPLES:
+        raise InputError(
+            f"{total:.4g} m2 of mesh need {total * per_m2:.2g} samples, more than {MOST_SAMPLES:.0e}; remove "
+            "triangles that are far too large, cut the mesh to the reference or give a larger --threshold"
+        )
     count = int(np.ceil(total * per_m2))
     for start in range(0, count, _SAMPLES_AT_ONCE):
         k = np.arange(start, min(start + _SAMPLES_AT_ONCE, count))
@@ -87,11 +94,13 @@ def _merge(parts: list[_Sums]) -> _Sums:
 
 
 def _cells(points: F32, voxel: float) -> I64:
-    cell = np.floor(points.astype(np.float64) / voxel).astype(np.int64) + (1 << (_CELL_BITS - 1))
-    if len(cell) and (cell.min() < 0 or cell.max() >= 1 << _CELL_BITS):
-        reach = voxel * (1 << (_CELL_BITS - 1))
+    half = 1 << (_CELL_BITS - 1)
+    place = np.floor(points.astype(np.float64) / voxel)
+    if len(place) and (place.min() < -half or place.max() >= half):
         raise InputError(
-            f"coordinates lie more than {reach / 1000:.0f} km from the origin; shift both clouds alike first"
+            f"coordinates lie more than {voxel * half / 1000:.3g} km from the origin, too far for voxels of "
+            f"{voxel:g} m; shift both clouds alike first or give a larger --threshold"
         )
+    cell = place.astype(np.int64) + half
     packed: I64 = (cell[:, 0] << (2 * _CELL_BITS)) | (cell[:, 1] << _CELL_BITS) | cell[:, 2]
     return packed
