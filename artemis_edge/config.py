@@ -33,39 +33,52 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     )
     levels: Annotated[int, Meta(description="Sizes of voxel planes, each twice the last.", ge=1, le=6)] = 4
     max_voxels: Annotated[
-        int, Meta(description="Voxels of all sizes in the local map; about 250 bytes each.", ge=10_000)
+        int,
+        Meta(
+            description="Voxels of all sizes in the local map; about 250 bytes each.",
+            ge=10_000,
+            le=10_000_000,
+        ),
     ] = 300_000
     insert_m: Annotated[
         float, _float("Spacing of the points that a scan adds to the local map, m.", ge=0.01, le=2.0)
     ] = 0.15
     points: Annotated[
-        int, Meta(description="Points of a scan that are registered, about; more are slower.", ge=200)
+        int,
+        Meta(
+            description="Points of a scan that are registered, about; more are slower.", ge=200, le=1_000_000
+        ),
     ] = 4000
     min_range_m: Annotated[
         float,
-        _float("Nearer points belong to the operator or the vehicle and are not registered, m.", ge=0.0),
+        _float(
+            "Nearer points belong to the operator or the vehicle and are not registered, m.", ge=0.0, le=100.0
+        ),
     ] = 0.5
     max_range_m: Annotated[
-        float, _float("Farther points are not registered, and farther voxels are forgotten, m.", gt=1.0)
+        float,
+        _float("Farther points are not registered, and farther voxels are forgotten, m.", gt=1.0, le=1000.0),
     ] = 100.0
     sigma_m: Annotated[
-        float, _float("Noise of one measured point along the surface normal, m.", gt=0.0, le=1.0)
+        float, _float("Noise of one measured point along the surface normal, m.", ge=0.001, le=1.0)
     ] = 0.03
     acceleration: Annotated[
-        float, _float("What the sensor's carrier may do to its velocity, m/s2.", gt=0.0)
+        float, _float("What the sensor's carrier may do to its velocity, m/s2.", ge=0.01, le=1000.0)
     ] = 3.0
     angular_acceleration: Annotated[
-        float, _float("What the sensor's carrier may do to its turn rate, rad/s2.", gt=0.0)
+        float, _float("What the sensor's carrier may do to its turn rate, rad/s2.", ge=0.01, le=1000.0)
     ] = 6.0
     start_speed: Annotated[
-        float, _float("How fast the sensor may already move when the recording starts, m/s.", gt=0.0)
+        float,
+        _float("How fast the sensor may already move when the recording starts, m/s.", ge=0.01, le=1000.0),
     ] = 15.0
     start_turn: Annotated[
-        float, _float("How fast the sensor may already turn when the recording starts, rad/s.", gt=0.0)
+        float,
+        _float("How fast the sensor may already turn when the recording starts, rad/s.", ge=0.001, le=100.0),
     ] = 0.5
-    gyro_sigma: Annotated[float, _float("Error of the gyroscope's rate, bias included, rad/s.", gt=0.0)] = (
-        0.02
-    )
+    gyro_sigma: Annotated[
+        float, _float("Error of the gyroscope's rate, bias included, rad/s.", ge=1e-5, le=10.0)
+    ] = 0.02
 
 
 class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,21 +93,25 @@ class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.8
     max_range_m: Annotated[
         float,
-        _float("Points farther than this are not mapped: they weigh less than 0.1 [m].", gt=0.0, le=1000.0),
+        _float("Points farther than this are not mapped: they weigh less than 0.1 [m].", ge=0.1, le=1000.0),
     ] = 60.0
     noise_range_m: Annotated[
         float,
-        _float("Range where the error from beam angle equals the ranging error: 2 cm / 1 mrad [m].", gt=0.0),
+        _float(
+            "Range where the error from beam angle equals the ranging error: 2 cm / 1 mrad [m].",
+            ge=0.1,
+            le=100_000.0,
+        ),
     ] = 20.0
     plane_sigma_m: Annotated[
         float,
-        _float("Thickness up to which points are one plane: ranging noise 1 sigma [m].", gt=0.0, le=0.5),
+        _float("Thickness up to which points are one plane: ranging noise 1 sigma [m].", ge=0.0001, le=0.5),
     ] = 0.02
     free_space: Annotated[
         bool, Meta(description="Whether vertices that later scans look through are removed.")
     ] = True
     free_space_range_m: Annotated[
-        float, _float("How far around the sensor vertices are judged by free space [m].", gt=0.0, le=200.0)
+        float, _float("How far around the sensor vertices are judged by free space [m].", ge=0.1, le=200.0)
     ] = 30.0
     free_space_slope: Annotated[
         float,
@@ -102,7 +119,11 @@ class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.02
     memory_budget_mb: Annotated[
         int,
-        Meta(description="Resident memory of the whole process; beyond it blocks go to disk [MB].", ge=600),
+        Meta(
+            description="Resident memory of the whole process; beyond it blocks go to disk [MB].",
+            ge=600,
+            le=1_000_000,
+        ),
     ] = 2000
 
 
@@ -114,7 +135,11 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.5
     least_evidence: Annotated[
         float,
-        _float("Evidence within one and a half spacings that makes a vertex (1: one hit close by).", ge=0.0),
+        _float(
+            "Evidence within one and a half spacings that makes a vertex (1: one hit close by).",
+            ge=0.0,
+            le=1000.0,
+        ),
     ] = 1.0
     short_edge: Annotated[
         float, _float("Edges up to this many point spacings are surface.", ge=1.0, le=4.0)
@@ -124,7 +149,8 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
         _float("Edges up to this many point spacings are surface where seen well or flat.", ge=1.0, le=4.0),
     ] = 4.0
     well_seen: Annotated[
-        float, _float("Evidence (hits at close range) of a vertex that carries a long edge.", gt=0.0)
+        float,
+        _float("Evidence (hits at close range) of a vertex that carries a long edge.", ge=0.01, le=1000.0),
     ] = 1.5
     coplanar: Annotated[
         float,
@@ -147,15 +173,23 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
     longest_wait_frames: Annotated[
         int, Meta(description="Frames after which a waiting voxel is meshed or let go.", ge=1, le=1000)
     ] = 20
-    fresh: Annotated[int, Meta(description="A patch is made anew when this many vertices are new.", ge=1)] = 4
+    fresh: Annotated[
+        int, Meta(description="A patch is made anew when this many vertices are new.", ge=1, le=1000)
+    ] = 4
     growth: Annotated[
-        float, _float("A patch is made anew when its evidence grew by this factor (3: noise halves).", gt=0.0)
+        float,
+        _float(
+            "A patch is made anew when its evidence grew by this factor (3: noise halves).",
+            ge=0.01,
+            le=1000.0,
+        ),
     ] = 3.0
     most_voxels: Annotated[
-        int, Meta(description="Voxels meshed in one frame at most; the rest waits.", ge=1)
+        int, Meta(description="Voxels meshed in one frame at most; the rest waits.", ge=1, le=1_000_000)
     ] = 500
     smallest_island: Annotated[
-        int, Meta(description="Islands of fewer triangles are left out of the finished mesh.", ge=1)
+        int,
+        Meta(description="Islands of fewer triangles are left out of the finished mesh.", ge=1, le=1_000_000),
     ] = 4
 
 

@@ -60,7 +60,11 @@ def _range(kind: Any) -> str:
     if not isinstance(kind, FloatType | IntType):
         return ""
     bounds = [(">=", kind.ge), (">", kind.gt), ("<=", kind.le), ("<", kind.lt)]
-    return ", ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
+    return ", ".join(f"{sign} {_bound(bound)}" for sign, bound in bounds if bound is not None)
+
+
+def _bound(bound: float) -> str:
+    return f"{bound:.0f}" if abs(bound) >= 1e5 else f"{bound:g}"
 
 
 if __name__ == "__main__":
