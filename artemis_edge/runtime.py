@@ -24,7 +24,7 @@ from artemis_edge.progress import Report, silent
 from artemis_edge.session.photos import INDEX, HeldOut
 from artemis_edge.session.report import Evaluation, RunStatistics, write_report
 from artemis_edge.session.results import Results, prepare, scratch
-from artemis_edge.trajectory import pose_per_frame, read_tum, write_tum
+from artemis_edge.trajectory import hole_sentence, pose_per_frame, read_tum, write_tum
 
 _WARM_UP_FRAMES = 3
 _WARM_UP_MB = 600
@@ -124,11 +124,13 @@ def choose_odometry(source: FrameSource, request: Request, span: range) -> Calla
         given = lidar_poses(source, read_tum(request.poses))
         poses = pose_per_frame(given, source.stamp_ns, span.start, span.stop, str(request.poses))
         # more poses than frames also tell how the sensor moved within a scan
-        chosen = given if len(given) > len(source.stamp_ns) else poses
-        return lambda: GivenPoses(chosen)
+        chosen = GivenPoses(given if len(given) > len(source.stamp_ns) else poses)
+        hole = None if len(given) == len(source.stamp_ns) else hole_sentence(given, poses.stamp_ns)
+        source.warnings.extend([] if hole is None else [f"{request.poses}: {hole}"])
+        return lambda: chosen
     if source.poses is not None and len(source.poses) and not request.own_odometry:
-        own = source.poses
-        return lambda: GivenPoses(own)
+        own = GivenPoses(source.poses)
+        return lambda: own
     return lambda: LidarOdometry.looking_ahead(request.config.odometry, _frames(source, span))
 
 

@@ -25,6 +25,8 @@ _UNIT_TOLERANCE = 0.05
 _FARTHEST_M = 1e8
 # Printed stamps are rounded: this far beyond the first or last pose that pose still holds.
 COVER_NS = 1_000_000
+# Between poses this many frame periods apart nobody knows how the sensor moved.
+_HOLE_FRAMES = 2.0
 
 
 def matrix_from_quaternion(translation: F64, quaternion: F64) -> F64:
@@ -187,6 +189,23 @@ def pose_per_frame(
     if not inside.all():
         raise InputError(_not_covered(poses, wanted, inside, start, name))
     return Trajectory(wanted, interpolate(poses, wanted))
+
+
+def hole_sentence(poses: Trajectory, frame_stamp_ns: I64) -> str | None:
+    """What to say of frames (n,) between poses more than two frame periods apart; None without such frames."""
+    if len(poses) < 2 or len(frame_stamp_ns) < 2:
+        return None
+    times = poses.stamp_ns
+    after = np.clip(np.searchsorted(times, frame_stamp_ns), 1, len(times) - 1)
+    gap = times[after] - times[after - 1]
+    apart = np.minimum(np.abs(frame_stamp_ns - times[after - 1]), np.abs(frame_stamp_ns - times[after]))
+    within = (gap > _HOLE_FRAMES * np.median(np.diff(frame_stamp_ns))) & (apart > COVER_NS)
+    if not within.any():
+        return None
+    return (
+        f"{int(within.sum())} frames lie in holes of the poses, the longest {gap[within].max() / 1e9:.2f} s; "
+        "their poses are interpolated across them"
+    )
 
 
 def _not_covered(poses: Trajectory, wanted: I64, inside: Bool, start: int, name: str) -> str:

@@ -332,7 +332,7 @@ def test_raw_images_become_png(tmp_path: Path) -> None:
             "image",
             [("/cam/image_raw/compressed", CompressedImage(Header(0, "cam"), "jpeg", b"no"), 0)] * 4,
             "cannot be decoded",
-            "images_uncalibrated",
+            "images_undecodable",
         ),
     ],
 )

@@ -75,6 +75,15 @@ def test_a_second_run_replaces_the_first(kitti: Path, fake_pipeline: list[Any], 
     assert json.loads((out / "report.json").read_text())["frames"] == 4
 
 
+def test_holes_in_the_poses_are_told(kitti: Path, fake_pipeline: list[Any], tmp_path: Path) -> None:
+    holey = tmp_path / "holey.tum"
+    rows = poses_of(kitti).read_text().splitlines(keepends=True)
+    holey.write_text("".join(rows[:2] + rows[6:]))
+    outcome = reprocess(Request(kitti, tmp_path / "out", poses=holey))
+    assert len(outcome.warnings) == 1
+    assert "holey.tum: 4 frames lie in holes of the poses, the longest 0.50 s" in outcome.warnings[0]
+
+
 def test_without_poses_the_odometry_runs(kitti: Path, fake_pipeline: list[Any], tmp_path: Path) -> None:
     reprocess(Request(kitti, tmp_path / "out", stop=3))
     assert type(fake_pipeline[-1].odometry).__name__ == "LidarOdometry"

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, Trajectory
 from artemis_edge.trajectory import (
+    hole_sentence,
     interpolate,
     inverse,
     matrix_from_quaternion,
@@ -169,6 +170,21 @@ def test_other_counts_interpolate_by_time() -> None:
     assert len(paired) == 21
     assert np.allclose(paired.T_world_lidar[10], poses.T_world_lidar[1])
     assert np.allclose(paired.T_world_lidar[5], _naive_interpolate(poses, SECOND // 2))
+
+
+def test_holes_are_told() -> None:
+    frames = np.arange(20) * SECOND // 10
+    times = np.arange(20) * SECOND // 10
+    whole = Trajectory(times, _random_poses(20))
+    assert hole_sentence(whole, frames) is None
+    every_other = Trajectory(times[::2], whole.T_world_lidar[::2])
+    assert hole_sentence(every_other, frames) is None
+    kept = np.r_[0:5, 9:20]
+    told = hole_sentence(Trajectory(times[kept], whole.T_world_lidar[kept]), frames)
+    assert told is not None
+    assert told.startswith("4 frames lie in holes of the poses, the longest 0.50 s")
+    assert hole_sentence(Trajectory(times[:1], whole.T_world_lidar[:1]), frames) is None
+    assert hole_sentence(whole, frames[:1]) is None
 
 
 def test_rounded_stamps_at_the_ends_are_covered() -> None:

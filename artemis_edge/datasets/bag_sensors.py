@@ -64,6 +64,11 @@ def find_lidars(index: BagIndex, config: InputConfig) -> list[Lidar]:
     tracks = _chosen(index, index.clouds, config.lidar_topics, "lidar_topics")
     if not tracks:
         topics = ", ".join(f"{name} ({kind})" for name, kind in sorted(index.types.items())) or "nothing"
+        if index.lost.get("truncated_file"):
+            raise InputError(
+                f"the recording is cut off or damaged, and up to there it holds no LiDAR clouds but {topics}; "
+                "copy it again or give one with a LiDAR"
+            )
         raise InputError(
             f"the recording holds no LiDAR clouds (PointCloud2 or livox CustomMsg) but {topics}; "
             "give one with a LiDAR"
@@ -82,7 +87,7 @@ def find_lidars(index: BagIndex, config: InputConfig) -> list[Lidar]:
 
 
 def find_cameras(index: BagIndex, config: InputConfig, lidar_frame: str) -> list[BagCamera]:
-    """The calibrated cameras of a recording whose mounting is known; others are left out with a warning."""
+    """The calibrated cameras of a recording whose mounting is known; others are counted, with a warning."""
     tracks = _chosen(index, index.images, config.image_topics, "image_topics")
     if not config.image_topics:
         tracks = [track for track in tracks if not track.topic.endswith("compressedDepth")]
@@ -91,7 +96,6 @@ def find_cameras(index: BagIndex, config: InputConfig, lidar_frame: str) -> list
     for track in tracks:
         model = _model(index, track)
         if model is None:
-            add_counts(index.lost, {"images_uncalibrated": len(track.references)})
             continue
         stamps = track.stamp_ns()
         T, known = _mounting(index, track.frame_id, lidar_frame, stamps)
@@ -219,30 +223,37 @@ def _model(index: BagIndex, track: Track) -> CameraModel | None:
     if info is None:
         info = next((i for i in index.infos.values() if i.header.frame_id == track.frame_id), None)
     if info is None:
-        index.warnings.append(f"{track.topic} is left out: there is no CameraInfo for it")
+        _leave_camera(index, track, "images_uncalibrated", "there is no CameraInfo for it")
         return None
     rectified = "rect" in track.topic.removesuffix("/compressed").rpartition("/")[2]
     model = camera_model(info, rectified)
     if model is None:
-        index.warnings.append(f"{track.topic} is left out: its CameraInfo is no pinhole with plumb_bob")
+        why = "its CameraInfo is no pinhole with plumb_bob"
+        _leave_camera(index, track, "images_uncalibrated", why)
         return None
     fault = _image_fault(track, model)
-    if fault:
-        index.warnings.append(f"{track.topic} is left out: {fault}")
-    return None if fault else model
+    if fault is not None:
+        _leave_camera(index, track, *fault)
+    return model if fault is None else None
 
 
-def _image_fault(track: Track, model: CameraModel) -> str | None:
-    """Why the first image does not fit the model, None if it does."""
+def _leave_camera(index: BagIndex, track: Track, reason: str, why: str) -> None:
+    add_counts(index.lost, {reason: len(track.references)})
+    index.warnings.append(f"{track.topic} is left out: {why}")
+
+
+def _image_fault(track: Track, model: CameraModel) -> tuple[str, str] | None:
+    """Reason and sentence why the first image is of no use with the model, None if it is."""
     try:
         pixels = cv2.imdecode(np.frombuffer(_image(track, 0), np.uint8), cv2.IMREAD_UNCHANGED)
     except (CdrError, cv2.error) as error:
-        return f"its images cannot be decoded ({error})"
+        return "images_undecodable", f"its images cannot be decoded ({error})"
     if pixels is None:
-        return "its images cannot be decoded"
+        return "images_undecodable", "its images cannot be decoded"
     if pixels.shape[:2] != (model.height, model.width):
         size = f"{pixels.shape[1]} x {pixels.shape[0]}"
-        return f"its images are {size} where CameraInfo says {model.width} x {model.height}"
+        says = f"its images are {size} where CameraInfo says {model.width} x {model.height}"
+        return "images_uncalibrated", says
     return None
 
 
