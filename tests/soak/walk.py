@@ -8,6 +8,7 @@ passes the budget. The scan is thinned (density) so that the recording is made i
 
 import argparse
 import json
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -21,16 +22,17 @@ from artemis_edge.mapping_run import Mapper
 from artemis_edge.pipeline import Pipeline
 from artemis_edge.progress import progress
 from artemis_edge.runtime import Request, reprocess
-from artemis_edge.session.simulate import simulate
 
 MOST_GROWTH = 1.1
-SETTINGS = {"density": "0.5", "camera": "off", "reference": "off", "mesh": "off"}
+SETTINGS = {"density": "0.2", "camera": "off", "reference": "off", "mesh": "off"}
 
 
 def soak(seconds: float, out: Path) -> dict[str, float | bool]:
     session = out / "session"
-    with progress("recording") as report:
-        made = simulate("street", 7, seconds, "avia", session, SETTINGS, report)
+    if not session.exists():  # in a process of its own: its memory is not the mapping's
+        sets = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
+        words = ["simulate", "street", "--seed", "7", "--seconds", str(seconds), *sets, "--out", str(session)]
+        subprocess.run([sys.executable, "-m", "artemis_edge.cli", *words], check=True)
     config = load(sets=["voxel_map.memory_budget_mb=1200"])
     resident: list[float] = []
 
@@ -44,7 +46,7 @@ def soak(seconds: float, out: Path) -> dict[str, float | bool]:
         resident.clear()  # of the warm-up
         return Watched(chosen, odometry, pages)
 
-    request = Request(session, out / "map", config, poses=made.truth / "trajectory.tum")
+    request = Request(session, out / "map", config, poses=session / "truth" / "trajectory.tum")
     with progress("mapping") as report:
         outcome = reprocess(request, report, make=make)
     tenths = np.array_split(np.array(outcome.statistics.cpu_ms), 10)
@@ -64,7 +66,9 @@ def soak(seconds: float, out: Path) -> dict[str, float | bool]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1200.0)
-    parser.add_argument("--out", type=Path, help="keep recording and map here")
+    parser.add_argument(
+        "--out", type=Path, help="keep recording and map here; a recording already there is mapped again"
+    )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="artemis-soak-") as scratch:
         found = soak(given.seconds, given.out or Path(scratch))
