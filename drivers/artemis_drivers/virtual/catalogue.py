@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from artemis_drivers.virtual import corridor, courtyard, hall, loaded, street
+from artemis_drivers.virtual.textures import TextureAtlas
 from artemis_drivers.virtual.world import World
 
 _LEAST_STREET_M = 100.0  # so that even a short walk looks down a street
@@ -26,8 +27,8 @@ def worlds() -> dict[str, BuildWorld]:
     }
 
 
-def _street(seed: int, length: float) -> World:
-    return street.build(seed, max(length + 2 * street.END_MARGIN_M, _LEAST_STREET_M))
+def _street(seed: int, length: float, atlas: TextureAtlas | None = None) -> World:
+    return street.build(seed, max(length + 2 * street.END_MARGIN_M, _LEAST_STREET_M), atlas)
 
 
 def build_world(name: str, seed: int, length: float) -> World:
