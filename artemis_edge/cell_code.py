@@ -42,6 +42,14 @@ def code_cell(code: int) -> int:
 
 
 @kernel
+def code_in(k: int, c: int) -> int:
+    """Code of cell ``c`` (0..63) of the voxel ``k`` of the 27."""
+    return code_of(
+        8 + (k // 9) * 4 + (c >> 4), 8 + ((k // 3) % 3) * 4 + ((c >> 2) & 3), 8 + (k % 3) * 4 + (c & 3)
+    )
+
+
+@kernel
 def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32) -> int:
     """Cells with evidence of a voxel (first) and within ``margin`` (0..4) cells around it.
 
@@ -57,12 +65,11 @@ def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32
 @kernel
 def gather_voxel(store: Store, w: int, k: int, margin: int, grid: I32, code: I32, n: int) -> int:
     """The part of ``gather_cells`` for one of the 27 voxels."""
-    first = code_of(8 + (k // 9) * 4, 8 + ((k // 3) % 3) * 4, 8 + (k % 3) * 4)
     mask = store.voxel_mask[w] & _WITHIN[margin, k]
     while mask != 0:
         c = lowest_bit(mask)
         mask &= mask - np.uint64(1)
-        at = first + ((c >> 4) << 10) + (((c >> 2) & 3) << 5) + (c & 3)
+        at = code_in(k, c)
         grid[at] = store.voxel_cell[w, c]
         code[n] = at
         n += 1

@@ -37,14 +37,19 @@ def _half_edges(faces: I32) -> I64:
     return np.stack([(f[k] << _SHIFT) | f[(k + 1) % 3] for k in range(3)])
 
 
+def _twins(keys: I64) -> tuple[I64, Bool]:
+    """For each directed edge key (n,) the place of the edge that runs the other way, and whether there is one."""
+    order = np.argsort(keys, kind="stable")
+    ranked = keys[order]
+    wanted = ((keys & 0xFFFFFFFF) << _SHIFT) | (keys >> _SHIFT)
+    at = np.searchsorted(ranked, wanted).clip(0, max(len(ranked) - 1, 0))
+    found: Bool = ranked[at] == wanted if len(ranked) else np.zeros(0, bool)
+    return order[at], found
+
+
 def free_edges(faces: I32) -> Bool:
     """Which edges of each triangle have no triangle on the other side, bool (t, 3)."""
-    keys = _half_edges(faces)
-    ranked = np.sort(keys.ravel())
-    twins = ((keys & 0xFFFFFFFF) << _SHIFT) | (keys >> _SHIFT)
-    at = np.searchsorted(ranked, twins.ravel()).clip(0, max(len(ranked) - 1, 0))
-    found = ranked[at] == twins.ravel() if len(ranked) else np.zeros(0, bool)
-    return ~found.reshape(3, -1).T
+    return ~_twins(_half_edges(faces).ravel())[1].reshape(3, -1).T
 
 
 def close_loops(vertices: F32, normals: F32, faces: I32, longest_m: float) -> I32:
@@ -228,12 +233,8 @@ def large_islands(faces: I32, least: int) -> Bool:
     """
     if least <= 1 or len(faces) == 0:
         return np.ones(len(faces), bool)
-    keys = _half_edges(faces).ravel()
-    order = np.argsort(keys, kind="stable")
-    twins = ((keys & 0xFFFFFFFF) << _SHIFT) | (keys >> _SHIFT)
-    at = np.searchsorted(keys[order], twins).clip(0, len(keys) - 1)
-    joined = keys[order[at]] == twins
-    here, there = np.flatnonzero(joined) % len(faces), order[at[joined]] % len(faces)
+    twin, joined = _twins(_half_edges(faces).ravel())
+    here, there = np.flatnonzero(joined) % len(faces), twin[joined] % len(faces)
     graph = coo_array((np.ones(len(here), bool), (here, there)), shape=(len(faces), len(faces)))
     piece = connected_components(graph, directed=False)[1]
     keep: Bool = np.bincount(piece)[piece] >= least

@@ -35,7 +35,7 @@ from artemis_edge.block_store import (
     VIEW,
     Store,
 )
-from artemis_edge.cell_code import CODES, OWN, code_of, gather_cells
+from artemis_edge.cell_code import CODES, OWN, code_in, code_of, gather_cells
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.eigen3 import smallest_eigen3
 from artemis_edge.frames import F32, F64, I32, U8, TrackedFrame
@@ -293,13 +293,11 @@ def _sum_layer(store: Store, cell_m: float, w: RefreshSpace) -> None:
         u = w.neighbour[k]
         if u < 0:
             continue
-        first = code_of(8 + (k // 9) * 4, 8 + ((k // 3) % 3) * 4, 8 + (k % 3) * 4)
         mask = store.voxel_mask[u]
         while mask != 0:
             c = bs.lowest_bit(mask)
             mask &= mask - np.uint64(1)
-            code = first + ((c >> 4) << 10) + (((c >> 2) & 3) << 5) + (c & 3)
-            _move_moments(store.evidence, store.voxel_cell[u, c], code, cell_m, w.moment, 216)
+            _move_moments(store.evidence, store.voxel_cell[u, c], code_in(k, c), cell_m, w.moment, 216)
             if own[0] > 0.0:
                 dx, dy, dz = own[1] / own[0] - wide[0], own[2] / own[0] - wide[1], own[3] / own[0] - wide[2]
                 if abs(dx * wide[3] + dy * wide[4] + dz * wide[5]) < cell_m:

@@ -8,7 +8,7 @@ from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.deskew import deskew_frame, window
-from artemis_edge.odometry.scan_motion import ScanMotion, covers, during, steady, through, times, turning
+from artemis_edge.odometry.scan_motion import ScanMotion, through, times, turning_or_steady
 from artemis_edge.trajectory import interpolate
 
 # Stamps this close belong together (the tolerance of ``evaluate trajectory``): printed times are rounded.
@@ -23,8 +23,8 @@ class GivenPoses:
     """Odometry that looks poses up: exactly at a pose's stamp, between two poses by constant velocity.
 
     The motion within a scan follows the poses themselves where they are denser than the scans, else the
-    gyroscope between them, else the twist and its change between the neighbouring poses; with a single pose it
-    is none. Raises InputError if the poses are unordered, do not cover a frame or lie more than 100 km from the
+    gyroscope between them, else the central difference over the neighbouring poses; with a single pose it is
+    none. Raises InputError if the poses are unordered, do not cover a frame or lie more than 100 km from the
     origin.
     """
 
@@ -63,10 +63,7 @@ class GivenPoses:
         if inside >= _DENSE * len(ends):
             T = interpolate(Trajectory(self._stamps, self._poses), stamps)
             return through(ends, se3.inverse(T_world_lidar) @ T)
-        if covers(frame.imu, int(stamps[0]), int(stamps[-1])):
-            near = during(frame.imu, int(stamps[0]), int(stamps[-1]))
-            return turning(near, frame.stamp_ns, twist[:3], ends)
-        return steady(twist)
+        return turning_or_steady(frame.imu, frame.stamp_ns, twist, ends)
 
     def at(self, stamp_ns: int) -> tuple[F64, F64]:
         """``T_world_lidar`` (4, 4) and the body twist (6,) (m/s, rad/s) at a stamp."""

@@ -21,7 +21,7 @@ from artemis_edge.odometry.deskew import deskew_frame, window
 from artemis_edge.odometry.motion import Motion, Prediction
 from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import DEGENERATE, Registration
-from artemis_edge.odometry.scan_motion import ScanMotion, covers, during, steady, times, turning
+from artemis_edge.odometry.scan_motion import ScanMotion, times, turning_or_steady
 from artemis_edge.odometry.thin import Thinner, ThinScan, TimedPoints
 
 _START_FRAMES = 2  # what it takes to know a velocity
@@ -178,10 +178,7 @@ class LidarOdometry:
         """Motion relative to the last registered scan: turns by the gyroscope where it covers the frame."""
         first_s, last_s = window(frame)
         ends = times(min(first_s + since_s, 0.0), max(last_s + since_s, 0.0))
-        first_ns, last_ns = (known.stamp_ns + round(t * 1e9) for t in (ends[0], ends[-1]))
-        if not covers(frame.imu, first_ns, last_ns):
-            return steady(known.twist)
-        return turning(during(frame.imu, first_ns, last_ns), known.stamp_ns, known.twist[:3], ends)
+        return turning_or_steady(frame.imu, known.stamp_ns, known.twist, ends)
 
     def _count(self, reason: str, number: int = 1) -> None:
         self.lost[reason] = self.lost.get(reason, 0) + number

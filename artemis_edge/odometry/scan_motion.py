@@ -73,6 +73,14 @@ def turning(imu: ImuSamples, reference_ns: int, velocity: F64, time_s: F64) -> S
     return through(time_s, _turned(sample_s, np.ascontiguousarray(imu.gyro), velocity, time_s))
 
 
+def turning_or_steady(imu: ImuSamples, reference_ns: int, twist: F64, time_s: F64) -> ScanMotion:
+    """Motion with the gyroscope's attitude where its samples cover the pieces' ends, else one twist (6,)."""
+    first_ns, last_ns = (reference_ns + round(float(t) * 1e9) for t in (time_s[0], time_s[-1]))
+    if not covers(imu, first_ns, last_ns):
+        return steady(twist)
+    return turning(during(imu, first_ns, last_ns), reference_ns, twist[:3], time_s)
+
+
 @njit
 def _turned(sample_s: F64, gyro: F64, velocity: F64, time_s: F64) -> F64:
     """Poses (n, 4, 4) relative to that at time 0: rates are linear between samples, constant beyond them."""
