@@ -27,6 +27,12 @@ EMPTY_KEY = -(2**63) + 1
 COUNT, SUM, SQUARE, VIEW, THROUGH, CONFIRMED, HITS = 0, 1, 4, 10, 13, 14, 15
 # Columns of Store.vertex
 POSITION, NORMAL, ROUGHNESS = 0, 3, 6
+# Columns of Store.attribute: mean colour (linear order red, green, blue, 0..255) and its information 1 / variance,
+# then the log-probabilities lambda of the classes (eq. 12). A row of zeros is a vertex nobody has looked at
+COLOUR, INFORMATION, LOG_CLASS = 0, 3, 4
+CLASSES = 16  # background and 15 slots
+# Columns of Store.voxel_class: class sums of eq. 1, then the accumulated weight W_sem of eq. 7
+WEIGHT = CLASSES
 # Columns of Store.voxel
 # PENDING: hits since the last meshing; FRESH: new vertices since then; AT_MESH: hits the last meshing knew;
 # QUEUED: stamp at which it began to wait for meshing, 0 when it does not
@@ -58,8 +64,10 @@ class Store(NamedTuple):
     voxel: I32  # (v, 12)
     voxel_mask: NDArray[np.uint64]  # (v,) which cells hold evidence
     voxel_cell: I32  # (v, 64) cell slot or -1
+    voxel_class: F32  # (v, 0) or (v, 17) with classes
     evidence: F32  # (c, 16) one cache line
     vertex: F32  # (c, 8)
+    attribute: F32  # (c, 0), (c, 4) with colours or (c, 20) with classes too
     state: U8  # (c,)
     triangle: NDArray[np.uint16]  # (t, 3) cell codes relative to the owning voxel
     queue: I32  # (v,) ring of voxels that wait for meshing
@@ -71,21 +79,38 @@ class Store(NamedTuple):
     free_patches: I64  # (PATCH_CLASSES,)
 
 
-def bytes_per_voxel(cells_per_voxel: float = 10.0, triangles_per_voxel: float = 24.0) -> float:
+def bytes_per_voxel(
+    cells_per_voxel: float = 10.0, triangles_per_voxel: float = 24.0, attributes: int = 0
+) -> float:
     """Memory of one occupied voxel with its cells and triangles [bytes].
 
     Ten cells and 24 triangle slots a voxel are what street and hall recordings fill (docs/tuning.md).
     """
-    cell = 16 * 4 + 8 * 4 + 1 + 4
-    return 64 * 4 + 12 * 4 + 8 + 4 + 4 + PATCH_CLASSES * 4 + cells_per_voxel * cell + triangles_per_voxel * 6
+    cell = 16 * 4 + 8 * 4 + attributes * 4 + 1 + 4
+    return (
+        class_columns(attributes) * 4
+        + 64 * 4
+        + 12 * 4
+        + 8
+        + 4
+        + 4
+        + PATCH_CLASSES * 4
+        + cells_per_voxel * cell
+        + triangles_per_voxel * 6
+    )
 
 
-def allocate(budget_bytes: float) -> Store:
-    """An empty map that can grow to ``budget_bytes``.
+def class_columns(attributes: int) -> int:
+    """Columns of ``Store.voxel_class`` beside ``attributes`` columns of ``Store.attribute``."""
+    return WEIGHT + 1 if attributes > LOG_CLASS else 0
+
+
+def allocate(budget_bytes: float, attributes: int = 0) -> Store:
+    """An empty map that can grow to ``budget_bytes``; ``attributes`` columns a vertex: 0, 4 or 20.
 
     ``TOUCHED_SHARE`` of it is resident from the start, so that no frame of the first minute waits for pages.
     """
-    voxels = max(int(budget_bytes / bytes_per_voxel()), 4096)
+    voxels = max(int(budget_bytes / bytes_per_voxel(attributes=attributes)), 4096)
     cells, triangles, blocks = voxels * 10, voxels * 24, max(voxels // 8, 512)
     slots = 1 << int(np.ceil(np.log2(2 * blocks)))
     store = Store(
@@ -97,8 +122,10 @@ def allocate(budget_bytes: float) -> Store:
         voxel=np.empty((voxels, 12), np.int32),
         voxel_mask=np.empty(voxels, np.uint64),
         voxel_cell=np.empty((voxels, 64), np.int32),
+        voxel_class=np.zeros((voxels, class_columns(attributes)), np.float32),
         evidence=np.zeros((cells, 16), np.float32),
         vertex=np.zeros((cells, 8), np.float32),
+        attribute=np.zeros((cells, attributes), np.float32),
         state=np.zeros(cells, np.uint8),
         triangle=np.empty((triangles, 3), np.uint16),
         queue=np.empty(voxels, np.int32),
@@ -188,6 +215,7 @@ def add_voxel(store: Store, block: int, inner: int, x: int, y: int, z: int) -> i
     store.voxel[v, BLOCK] = block
     store.voxel_mask[v] = 0
     store.voxel_cell[v, :] = -1
+    store.voxel_class[v, :] = 0.0
     return v
 
 
@@ -331,6 +359,7 @@ def remove_block(store: Store, block: int) -> None:
             if s >= 0:
                 store.evidence[s, :] = 0.0
                 store.vertex[s, :] = 0.0
+                store.attribute[s, :] = 0.0
                 store.state[s] = EVIDENCE_ONLY
                 store.free_cell[store.counter[FREE_CELLS]] = s
                 store.counter[FREE_CELLS] += 1

@@ -111,7 +111,12 @@ class DeskewedScan:
 
 @dataclass(frozen=True, slots=True)
 class TrackedFrame:
-    """A frame with its pose: what odometry hands to the mapping."""
+    """A frame with its pose: what odometry hands to the mapping.
+
+    ``image_poses`` are T_world_lidar (4, 4) at the stamps of ``images``, one each; ``twist`` (6,) is the body's
+    (m/s, rad/s) at the frame's stamp. ``degenerate_direction`` is the unit vector in world along which the scan
+    tells least, where ``degenerate``.
+    """
 
     index: int
     stamp_ns: int
@@ -119,6 +124,9 @@ class TrackedFrame:
     scans: tuple[DeskewedScan, ...]
     degenerate: bool = False
     images: tuple[CameraImage, ...] = ()
+    image_poses: tuple[F64, ...] = ()
+    twist: F64 = field(default_factory=lambda: np.zeros(6))
+    degenerate_direction: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

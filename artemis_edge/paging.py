@@ -37,7 +37,7 @@ TIGHT = 0.85  # share of a pool from which on blocks go to disk
 BUSY_FRAMES = 50  # a block seen this lately is not sent to disk
 
 _HEADER = struct.Struct("<4sIiiiIII")
-_MAGIC = b"AEP1"
+_MAGIC = b"AEP2"
 _META = (PENDING, FRESH, AT_MESH)
 
 
@@ -46,8 +46,8 @@ class Page:
     """One block or several: rows of ``block`` (b, 3) own ``n_voxels`` voxels each, those own cells and triangles.
 
     ``inner`` int16 (v,) place of a voxel in its block, ``meta`` int32 (v, 3), ``n_cells`` and ``n_triangles``
-    int16 (v,); ``cell`` uint8 (c,), ``evidence`` float32 (c, 16), ``vertex`` float32 (c, 8), ``state`` uint8 (c,);
-    ``triangle`` uint16 (t, 3) codes.
+    int16 (v,), ``voxel_class`` float32 (v, 0 or 17); ``cell`` uint8 (c,), ``evidence`` float32 (c, 16), ``vertex``
+    float32 (c, 8), ``attribute`` float32 (c, 0, 4 or 20), ``state`` uint8 (c,); ``triangle`` uint16 (t, 3) codes.
     """
 
     block: I32
@@ -56,9 +56,11 @@ class Page:
     meta: I32
     n_cells: np.ndarray
     n_triangles: np.ndarray
+    voxel_class: F32
     cell: U8
     evidence: F32
     vertex: F32
+    attribute: F32
     state: U8
     triangle: np.ndarray
 
@@ -69,9 +71,11 @@ class Page:
             self.meta,
             self.n_cells,
             self.n_triangles,
+            self.voxel_class,
             self.cell,
             self.evidence,
             self.vertex,
+            self.attribute,
             self.state,
             self.triangle,
         )
@@ -136,9 +140,11 @@ def fill_page(
     meta: I32,
     n_cells: np.ndarray,
     n_triangles: np.ndarray,
+    voxel_class: F32,
     cell: U8,
     evidence: F32,
     vertex: F32,
+    attribute: F32,
     state: U8,
     triangle: np.ndarray,
 ) -> None:
@@ -156,6 +162,8 @@ def fill_page(
                 store.voxel[v, AT_MESH],
             )
             n_triangles[i] = store.voxel[v, PATCH_LEN]
+            for q in range(voxel_class.shape[1]):
+                voxel_class[i, q] = store.voxel_class[v, q]
             for t in range(store.voxel[v, PATCH_LEN]):
                 for q in range(3):
                     triangle[k, q] = store.triangle[store.voxel[v, PATCH_AT] + t, q]
@@ -171,6 +179,8 @@ def fill_page(
                     evidence[j, q] = store.evidence[s, q]
                 for q in range(8):
                     vertex[j, q] = store.vertex[s, q]
+                for q in range(attribute.shape[1]):
+                    attribute[j, q] = store.attribute[s, q]
                 j += 1
             n_cells[i] = j - first
             i += 1
@@ -187,9 +197,11 @@ def pack(store: Store, slots: I32) -> Page:
         meta=np.empty((v, 3), np.int32),
         n_cells=np.empty(v, np.int16),
         n_triangles=np.empty(v, np.int16),
+        voxel_class=np.empty((v, store.voxel_class.shape[1]), np.float32),
         cell=np.empty(c, np.uint8),
         evidence=np.empty((c, 16), np.float32),
         vertex=np.empty((c, 8), np.float32),
+        attribute=np.empty((c, store.attribute.shape[1]), np.float32),
         state=np.empty(c, np.uint8),
         triangle=np.empty((t, 3), np.uint16),
     )
@@ -210,15 +222,18 @@ def restore_block(
     meta: I32,
     n_cells: np.ndarray,
     n_triangles: np.ndarray,
+    voxel_class: F32,
     cell: U8,
     evidence: F32,
     vertex: F32,
+    attribute: F32,
     state: U8,
     triangle: np.ndarray,
 ) -> bool:
     """Bring one block's page back into slot ``block``, which may have received points since; False: no room.
 
-    Evidence adds up. A patch made since then is kept, else the page's comes back.
+    Evidence and what is known of classes add up; colours seen anew stay. A patch made since then is kept, else the
+    page's comes back.
     """
     j = k = 0
     x0, y0, z0 = store.block[block, 0] * 8, store.block[block, 1] * 8, store.block[block, 2] * 8
@@ -234,6 +249,8 @@ def restore_block(
         store.voxel[v, PENDING] += meta[i, 0]
         store.voxel[v, FRESH] += meta[i, 1]
         store.voxel[v, AT_MESH] += meta[i, 2]
+        for q in range(voxel_class.shape[1]):
+            store.voxel_class[v, q] += voxel_class[i, q]
         for _ in range(n_cells[i]):
             s = store.voxel_cell[v, cell[j]]
             if s < 0:
@@ -242,6 +259,7 @@ def restore_block(
                     return False
             for q in range(16):
                 store.evidence[s, q] += evidence[j, q]
+            _merge_attributes(store.attribute, s, attribute, j)
             if store.state[s] == 0:
                 store.state[s] = state[j]
                 for q in range(8):
@@ -257,6 +275,16 @@ def restore_block(
     # most come back because a neighbour needs them, and may go again soon
     store.block[block, SEEN] = max(store.block[block, SEEN], stamp - BUSY_FRAMES + 5)
     return True
+
+
+@kernel
+def _merge_attributes(now: F32, s: int, before: F32, j: int) -> None:
+    """Logarithms of likelihoods add up (eq. 12); of two colours the newer stays."""
+    if now.shape[1] > bs.INFORMATION and now[s, bs.INFORMATION] == 0.0:
+        for q in range(bs.LOG_CLASS):
+            now[s, q] = before[j, q]
+    for q in range(bs.LOG_CLASS, now.shape[1]):
+        now[s, q] += before[j, q]
 
 
 @kernel
@@ -314,7 +342,12 @@ def resident_blocks(store: Store, out: I32) -> int:
 def page_bytes(page: Page) -> bytes:
     """A page of one block as bytes."""
     head = _HEADER.pack(
-        _MAGIC, len(page.inner), *page.block[0].tolist(), len(page.cell), len(page.triangle), 0
+        _MAGIC,
+        len(page.inner),
+        *page.block[0].tolist(),
+        len(page.cell),
+        len(page.triangle),
+        page.attribute.shape[1],
     )
     return head + b"".join(np.ascontiguousarray(a).tobytes() for a in page.arrays())
 
@@ -323,7 +356,7 @@ def page_from_bytes(data: bytes) -> Page:
     """Inverse of ``page_bytes``; ValueError when the bytes are not a whole page."""
     if len(data) < _HEADER.size:
         raise ValueError("page too short")
-    magic, v, bx, by, bz, c, t, _ = _HEADER.unpack_from(data)
+    magic, v, bx, by, bz, c, t, attributes = _HEADER.unpack_from(data)
     if magic != _MAGIC:
         raise ValueError("not a page")
     shapes: list[tuple[str, tuple[int, ...]]] = [
@@ -331,9 +364,11 @@ def page_from_bytes(data: bytes) -> Page:
         ("<i4", (v, 3)),
         ("<i2", (v,)),
         ("<i2", (v,)),
+        ("<f4", (v, bs.class_columns(attributes))),
         ("<u1", (c,)),
         ("<f4", (c, 16)),
         ("<f4", (c, 8)),
+        ("<f4", (c, attributes)),
         ("<u1", (c,)),
         ("<u2", (t, 3)),
     ]
@@ -436,7 +471,7 @@ class Pager:
         block = self._store.block[touched, BX : BX + 3]
         around = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)
         keys = np.unique(block_keys((block[:, None] + around[None]).reshape(-1, 3).astype(np.int32)))
-        wanted = np.intersect1d(keys, self.file.keys(), assume_unique=True).tolist()
+        wanted = [key for key in keys.tolist() if key in self.file]
         own = set(block_keys(block).tolist())
         if wanted:
             self._store.block[touched, SEEN] = stamp

@@ -9,7 +9,7 @@ import pytest
 
 from artemis_edge import block_store as bs
 from artemis_edge.frames import I64
-from artemis_edge.paging import Page, PageFile, block_keys, pack, page_bytes, page_from_bytes
+from artemis_edge.paging import Page, PageFile, block_keys, pack, page_bytes, page_from_bytes, restore_block
 from tests import naive
 
 # Holds what the sensor sees in the corridor and half as much again, not the corridor
@@ -227,3 +227,26 @@ def _carve_beside_blocks_on_disk(folder: Path, seed: int) -> None:
 def test_meshing_beside_a_block_on_disk_stays_manifold(tmp_path: Path) -> None:
     for seed in range(8):
         _carve_beside_blocks_on_disk(tmp_path / str(seed), seed)
+
+
+@pytest.mark.parametrize("attributes", [0, 4, 20])
+def test_attributes_come_back_and_are_added_to_what_was_learned_since(attributes: int) -> None:
+    store = bs.allocate(1.0, attributes)
+    block = bs.find_or_add_block(store, 0, 0, 0)
+    v = bs.add_voxel(store, block, 0, 0, 0, 0)
+    s = bs.add_cell(store, v, 5)
+    store.attribute[s] = np.arange(1, attributes + 1)
+    store.voxel_class[v] = 2.0
+    page = page_from_bytes(page_bytes(pack(store, np.array([block], np.int32))))
+    bs.remove_block(store, block)
+    again = bs.find_or_add_block(store, 0, 0, 0)
+    w = bs.add_voxel(store, again, 0, 0, 0, 0)
+    t = bs.add_cell(store, w, 5)
+    assert not store.attribute[t].any() and not store.voxel_class[w].any(), "memory given back is all zeros"
+    store.attribute[t] = 7.0
+    store.voxel_class[w] = 1.0
+    assert restore_block(store, again, 1, *page.arrays())
+    colour, classes = store.attribute[t, : bs.LOG_CLASS], store.attribute[t, bs.LOG_CLASS :]
+    assert (colour == 7.0).all(), "the newer colour stays"
+    np.testing.assert_array_equal(classes, 7.0 + np.arange(bs.LOG_CLASS + 1, attributes + 1))
+    assert (store.voxel_class[w] == 3.0).all()

@@ -53,7 +53,24 @@ class GivenPoses:
         T_world_lidar, twist = self.at(frame.stamp_ns)
         motion = self._during(frame, T_world_lidar, twist)
         scans = deskew_frame(frame, motion)
-        return TrackedFrame(frame.index, frame.stamp_ns, T_world_lidar, scans, images=frame.images)
+        return TrackedFrame(
+            frame.index,
+            frame.stamp_ns,
+            T_world_lidar,
+            scans,
+            images=frame.images,
+            image_poses=self._at_images(frame, T_world_lidar, twist),
+            twist=twist,
+        )
+
+    def _at_images(self, frame: SyncedFrame, T_world_lidar: F64, twist: F64) -> tuple[F64, ...]:
+        """T_world_lidar when each image was taken; beyond the given poses the motion goes on."""
+        poses = []
+        for image in frame.images:
+            inside = self._stamps[0] <= image.stamp_ns <= self._stamps[-1]
+            since_s = (image.stamp_ns - frame.stamp_ns) * 1e-9
+            poses.append(self.at(image.stamp_ns)[0] if inside else T_world_lidar @ se3.exp(since_s * twist))
+        return tuple(poses)
 
     def _during(self, frame: SyncedFrame, T_world_lidar: F64, twist: F64) -> ScanMotion:
         first_s, last_s = window(frame)

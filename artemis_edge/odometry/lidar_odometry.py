@@ -168,16 +168,20 @@ class LidarOdometry:
         """The frame with the pose that the present motion has at its stamp."""
         known = self._motion or Motion(np.eye(4), frame.stamp_ns, np.zeros(6))
         since_s = (frame.stamp_ns - known.stamp_ns) * 1e-9
-        moved = self._during(frame, known, since_s)
+        images_s = [(image.stamp_ns - known.stamp_ns) * 1e-9 for image in frame.images]
+        moved = self._during(frame, known, since_s, images_s)
         scans = deskew_frame(frame, moved.referred_to(since_s))
         T = known.T_world_lidar @ moved.at(since_s)
-        return TrackedFrame(frame.index, frame.stamp_ns, T, scans, degenerate, frame.images)
+        at_images = tuple(known.T_world_lidar @ moved.at(t) for t in images_s)
+        return TrackedFrame(
+            frame.index, frame.stamp_ns, T, scans, degenerate, frame.images, at_images, known.twist
+        )
 
     @staticmethod
-    def _during(frame: SyncedFrame, known: Motion, since_s: float) -> ScanMotion:
+    def _during(frame: SyncedFrame, known: Motion, since_s: float, images_s: list[float]) -> ScanMotion:
         """Motion relative to the last registered scan: turns by the gyroscope where it covers the frame."""
         first_s, last_s = window(frame)
-        ends = times(min(first_s + since_s, 0.0), max(last_s + since_s, 0.0))
+        ends = times(min(first_s + since_s, 0.0, *images_s), max(last_s + since_s, 0.0, *images_s))
         return turning_or_steady(frame.imu, known.stamp_ns, known.twist, ends)
 
     def _count(self, reason: str, number: int = 1) -> None:
