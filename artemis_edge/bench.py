@@ -60,7 +60,7 @@ def _measure(request: Request, plain: bool, make: MakeMapper) -> dict[str, Any]:
     odometry = choose_odometry(source, request, span)
     statistics = RunStatistics(source.name, source.input_hz)
     with Interrupt() as interrupt, progress("measuring", plain) as report:
-        warm_up_run(request.config, odometry, request.out, source, span, statistics, make)
+        warm_up_run(request, odometry, request.out, source, span, statistics, make)
         tracker = odometry()
         mapper = make(request.config, tracker, request.out)
         run = MappingRun(mapper, source, span, statistics)

@@ -172,12 +172,11 @@ def readable(source: FrameSource, span: range) -> Iterator[tuple[SyncedFrame | N
             yield None, error
 
 
-def warm_up(make: Callable[[], Mapper], source: FrameSource, span: range, frames: int) -> float:
-    """Compile or load every kernel on a throw-away map of the first frames; returns the seconds it took.
+def warm_up(make: Callable[[], Mapper], source: FrameSource, span: range, frames: int) -> None:
+    """Compile or load every kernel on a throw-away map of the first frames.
 
     The input's own frames, because kernels are compiled for the very types that they meet.
     """
-    start = time.perf_counter()
     try:
         mapper = make()
         for frame in source.frames(span.start, min(span.start + frames, span.stop)):
@@ -185,7 +184,6 @@ def warm_up(make: Callable[[], Mapper], source: FrameSource, span: range, frames
         mapper.finish()
     except (UserError, OSError):
         pass  # the run itself will meet the same fault and count it
-    return time.perf_counter() - start
 
 
 def _sentence(error: RunError | OSError) -> str:

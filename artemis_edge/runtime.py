@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import msgspec
 
 from artemis_edge import health
+from artemis_edge.compile_ahead import compile_ahead
 from artemis_edge.config import Config, to_toml
 from artemis_edge.datasets import lidar_poses, open_input
 from artemis_edge.errors import InputError, RunError
@@ -89,7 +91,7 @@ def reprocess(
     statistics = RunStatistics(source.name, source.input_hz, config_toml=to_toml(request.config))
     with scratch(request.out) as pages:
         with Interrupt() as interrupt:
-            warm_up_run(request.config, odometry, pages, source, span, statistics, make)
+            warm_up_run(request, odometry, pages, source, span, statistics, make)
             tracker = odometry()
             mapper = make(request.config, tracker, pages)
             run = MappingRun(mapper, source, span, statistics)
@@ -139,7 +141,7 @@ def _frames(source: FrameSource, span: range) -> Iterator[SyncedFrame]:
 
 
 def warm_up_run(
-    config: Config,
+    request: Request,
     odometry: Callable[[], Odometry],
     pages: Path,
     source: FrameSource,
@@ -147,13 +149,29 @@ def warm_up_run(
     statistics: RunStatistics,
     make: MakeMapper,
 ) -> None:
-    """Kernels ready before the first frame; the map of the warm-up is as small as can be."""
+    """Kernels ready before the first frame."""
+    start = time.perf_counter()
+    if make is pipeline:
+        compile_ahead(request, source, span)
+    warm_up_here(request.config, odometry, pages, source, span, make)
+    statistics.warmup_s = time.perf_counter() - start
+    gc.collect()
+
+
+def warm_up_here(
+    config: Config,
+    odometry: Callable[[], Odometry],
+    pages: Path,
+    source: FrameSource,
+    span: range,
+    make: MakeMapper,
+) -> None:
+    """Load every kernel into this process, compiled or not; the map of the warm-up is as small as can be."""
     small = msgspec.structs.replace(config.voxel_map, memory_budget_mb=_WARM_UP_MB)
     tiny = msgspec.structs.replace(config, voxel_map=small)
     folder = pages / "warm-up"
     folder.mkdir()
-    statistics.warmup_s = warm_up(lambda: make(tiny, odometry(), folder), source, span, _WARM_UP_FRAMES)
-    gc.collect()
+    warm_up(lambda: make(tiny, odometry(), folder), source, span, _WARM_UP_FRAMES)
 
 
 def count_losses(statistics: RunStatistics, source: FrameSource, odometry: Odometry, mapper: Mapper) -> None:

