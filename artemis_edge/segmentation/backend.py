@@ -65,17 +65,16 @@ class Grid:
         """The grid of a part of the map that begins at cell (x, y)."""
         return Grid(self.scale_x, self.scale_y, self.offset_x - x, self.offset_y - y)
 
-    def at_pixels(self, cells: F32 | U8, width: int, height: int) -> F32 | U8:
-        """A map (h, w) or (h, w, layers) seen at every pixel of the image, bilinear; 0 beyond the map."""
+    def at_pixels(self, cells: F32 | U8, width: int, height: int, repeat: bool = False) -> F32 | U8:
+        """A map (h, w) seen at every pixel of an image, bilinear; beyond it 0, or its border where ``repeat``."""
         from_pixels = np.array([[self.scale_x, 0.0, self.offset_x], [0.0, self.scale_y, self.offset_y]])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        # OpenCV warps at most four channels at once
-        layers = [cells] if cells.ndim == 2 else [cells[:, :, k] for k in range(cells.shape[2])]
-        warped = [
-            cv2.warpAffine(np.ascontiguousarray(layer), from_pixels, (width, height), flags=flags)
-            for layer in layers
-        ]
-        return warped[0] if cells.ndim == 2 else np.stack(warped, axis=2)
+        return cv2.warpAffine(  # type: ignore[no-any-return]
+            np.ascontiguousarray(cells),
+            from_pixels,
+            (width, height),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE if repeat else cv2.BORDER_CONSTANT,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +82,8 @@ class Instance:
     """One object in one image.
 
     ``probability`` is p(base class | instance); ``mask`` float32 (h, w) 0..1 the mask's own probability on
-    ``grid``, cut to the box (0 beyond); ``box`` x0, y0, x1, y1 in pixels of the image; ``label`` what the model
-    itself calls it.
+    ``grid``, cut to the box (0 beyond); ``box`` x0, y0, x1, y1 are its edges on the image, where pixel k reaches
+    from k to k + 1; ``label`` what the model itself calls it.
     """
 
     slot: int
@@ -112,6 +111,11 @@ class DenseScores:
     slots: tuple[int, ...]
     score: U8
     grid: Grid
+
+    def layer(self, slot: int, width: int, height: int) -> U8:
+        """Scores of one slot at every pixel of an image: uint8 (height, width), 255 is probability 1."""
+        cells = self.score[:, :, self.slots.index(slot)]
+        return np.asarray(self.grid.at_pixels(cells, width, height, repeat=True), np.uint8)
 
     def sample(self, u: NDArray[np.floating], v: NDArray[np.floating]) -> F32:
         """Scores 0..1 at pixels (u, v), each (n,): float32 (n, layers), bilinear, clamped to the map."""

@@ -1,0 +1,127 @@
+"""Backend ``semantic``: one logit a class at every pixel; instances are what hangs together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from artemis_edge.frames import F32, U8
+from artemis_edge.segmentation import scores
+from artemis_edge.segmentation.backend import (
+    BACKGROUND,
+    DenseScores,
+    Grid,
+    Instance,
+    Prompt,
+    Segmentation,
+    Status,
+    Support,
+)
+from artemis_edge.segmentation.letterbox import Letterbox
+from artemis_edge.segmentation.manifest import Manifest
+from artemis_edge.segmentation.network import Array, Network
+from artemis_edge.segmentation.words import canonical
+from artemis_edge.segmentation.yolo_seg import Thresholds, closed_support, input_of
+
+_LEAST_CELLS = 4  # smaller patches are noise of single cells
+_PAD = 0
+
+
+def probabilities(logits: Array) -> F32:
+    """Softmax over the classes of every cell: (C, h, w) logits to float32 probabilities."""
+    weight = logits.astype(np.float32)
+    weight -= weight.max(axis=0)
+    np.exp(weight, out=weight)
+    weight /= weight.sum(axis=0)
+    return weight
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """The part of the output that shows the image: ``probability`` (C, h, w), where it lies, and which class wins."""
+
+    probability: F32
+    grid: Grid
+    box: Letterbox
+
+
+class Semantic:
+    """Labels every pixel. The classes exclude each other, so a softmax over them at a pixel is right."""
+
+    def __init__(self, network: Network, manifest: Manifest, thresholds: Thresholds) -> None:
+        self.name = manifest.name
+        self.classes = manifest.classes
+        self._network = network
+        self._manifest = manifest
+        self._thresholds = thresholds
+        self._row = {canonical(label): k for k, label in reversed(list(enumerate(manifest.classes)))}
+        self._row.pop("background", None)
+
+    def support(self, text: str) -> Support:
+        """Whether it is one of the classes."""
+        return closed_support(self.name, self._row, text)
+
+    def segment(self, image: U8, prompts: Sequence[Prompt]) -> Segmentation:
+        """Label the image by the network; see :class:`Backend`."""
+        size, fixed = input_of(self._network, self._manifest)
+        box = Letterbox.fit(image.shape[:2], size, fixed, self._manifest.stride, centred=False)
+        filled = box.fill(image, _PAD, self._manifest.mean, self._manifest.std)
+        (logits,) = self._network.run(filled).values()
+        rows, columns = box.cells(logits.shape[3], logits.shape[2])
+        grid = box.grid(logits.shape[3], logits.shape[2]).cropped(columns.start, rows.start)
+        view = _View(probabilities(logits[0, :, rows, columns]), grid, box)
+        support = [self.support(prompt.text) for prompt in prompts]
+        known = [p for p, s in zip(prompts, support, strict=True) if s.status is not Status.UNSUPPORTED]
+        found = self._instances(view, known)
+        return Segmentation(
+            box.image[0],
+            box.image[1],
+            scores.answers(prompts, support, found),
+            tuple(found),
+            self._dense(view, known),
+        )
+
+    def _dense(self, view: _View, prompts: Sequence[Prompt]) -> DenseScores:
+        """A layer a prompt; what is left of probability 1 is background."""
+        layers = [view.probability[self._row[prompt.text]] for prompt in prompts]
+        nothing = np.ones(view.probability.shape[1:], np.float32)
+        for layer in {self._row[prompt.text] for prompt in prompts}:
+            nothing -= view.probability[layer]
+        slots = (BACKGROUND, *(prompt.slot for prompt in prompts))
+        return DenseScores(slots, scores.quantised(np.stack([nothing, *layers], axis=2)), view.grid)
+
+    def _instances(self, view: _View, prompts: Sequence[Prompt]) -> list[Instance]:
+        winner = view.probability.argmax(axis=0)
+        out: list[Instance] = []
+        for prompt in prompts:
+            row = self._row[prompt.text]
+            won = (winner == row).astype(np.uint8)
+            _, label, stats, _ = cv2.connectedComponentsWithStats(won, connectivity=8)
+            big = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _LEAST_CELLS)
+            for part in big[big > 0]:
+                left, top, wide, high, _ = (int(v) for v in stats[part])
+                cut = slice(top, top + high), slice(left, left + wide)
+                out.append(
+                    self._instance(view, prompt, label[cut] == part, view.probability[row][cut], (left, top))
+                )
+        likely = [found for found in out if found.probability >= self._thresholds.score]
+        likely.sort(key=lambda found: -found.probability)
+        return likely[: self._thresholds.most]
+
+    def _instance(
+        self, view: _View, prompt: Prompt, inside: np.ndarray, probability: F32, start: tuple[int, int]
+    ) -> Instance:
+        """One connected part. Its probability is the mean; the mask makes p times mask the network's own, up to 1."""
+        mean = float(probability[inside].mean())
+        mask = np.where(inside, np.minimum(probability / mean, 1.0), 0.0).astype(np.float32)
+        grid = view.grid.cropped(*start)
+        high, wide = inside.shape
+        corner = np.array([[-0.5, -0.5], [wide - 0.5, high - 0.5]])
+        pixel = (corner - [grid.offset_x, grid.offset_y]) / [grid.scale_x, grid.scale_y] + 0.5
+        (x0, y0), (x1, y1) = np.clip(pixel, 0, view.box.image).tolist()
+        return Instance(
+            prompt.slot, prompt.text, self.classes[self._row[prompt.text]], mean, (x0, y0, x1, y1), mask, grid
+        )
