@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from artemis_edge.commands import models
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -89,7 +90,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_demo, _simulate, _reprocess, _evaluate, _bench, _render, _export, _check, _session):
+    for add in (
+        _demo,
+        _simulate,
+        _reprocess,
+        _evaluate,
+        _bench,
+        _render,
+        _export,
+        _check,
+        _session,
+        models.add,
+    ):
         add(commands)
     return parser
 

@@ -17,7 +17,15 @@ from artemis_edge.errors import InputError, RunError, UserError
 from artemis_edge.segmentation.backend import Backend
 from artemis_edge.segmentation.manifest import Kind, Manifest, Part, read_manifest, write_manifest
 from artemis_edge.segmentation.network import Network
-from artemis_edge.segmentation.opening import ROLES, Smoke, guess_kind, names_in, open_model, smoke_test
+from artemis_edge.segmentation.opening import (
+    ROLES,
+    Smoke,
+    check_signature,
+    guess_kind,
+    names_in,
+    open_model,
+    smoke_test,
+)
 from artemis_edge.segmentation.yolo_seg import Thresholds
 
 STORE_VARIABLE = "ARTEMIS_MODEL_STORE"
@@ -46,7 +54,7 @@ class Addition:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A model of the registry; ``problem`` is a sentence where its files are not those that were registered."""
+    """A model of the registry; ``problem`` is a sentence where its manifest or files are not there."""
 
     manifest: Manifest
     folder: Path
@@ -55,8 +63,9 @@ class Entry:
 
     def open(self, thresholds: Thresholds | None = None) -> Backend:
         """The model at work; raises InputError where its files are damaged."""
-        if self.problem:
-            raise InputError(self.problem)
+        problem = self.problem or _damage(self.manifest, self.folder)
+        if problem:
+            raise InputError(problem)
         return open_model(self.manifest, self.folder, thresholds)
 
 
@@ -134,13 +143,16 @@ class Registry:
         network = Network(wanted.file)
         kind = wanted.kind or guess_kind(network)
         _check_roles(kind, wanted.parts)
+        inside = names_in(network) if kind in ("yolo-seg", "semantic") else ()
+        classes = wanted.classes or inside
+        check_signature(network, kind, len(classes))
         said = Manifest(
             name=name,
             kind=kind,
             file="model.onnx",
             sha256=wanted.sha256["model"].lower(),
             licence=wanted.licence or network.metadata.get("license", _NOT_STATED),
-            classes=wanted.classes or (names_in(network) if kind in ("yolo-seg", "semantic") else ()),
+            classes=classes,
             parts={role: _part_of(role, files[role], wanted.sha256[role]) for role in wanted.parts},
             inputs={key: tuple(side or 0 for side in shape) for key, shape in network.inputs.items()},
             outputs={key: tuple(side or 0 for side in shape) for key, shape in network.outputs.items()},
@@ -226,17 +238,24 @@ def _entry(path: Path, shipped: bool) -> Entry:
         name = path.stem if shipped else path.parent.name
         broken = Manifest(name=name, kind="yolo-seg", file="none", sha256="0" * 64, licence=_NOT_STATED)
         return Entry(broken, path.parent, shipped, str(error))
-    return Entry(manifest, path.parent, shipped, _damage(manifest, path.parent))
+    return Entry(manifest, path.parent, shipped, _missing(manifest, path.parent))
+
+
+def _files(manifest: Manifest) -> dict[str, str]:
+    """Hash by file name."""
+    return {manifest.file: manifest.sha256, **{part.file: part.sha256 for part in manifest.parts.values()}}
+
+
+def _missing(manifest: Manifest, folder: Path) -> str:
+    lost = [file for file in _files(manifest) if not (folder / file).is_file()]
+    if not lost:
+        return ""
+    return f"the model {manifest.name} is incomplete ({lost[0]} is gone); remove it and add it again"
 
 
 def _damage(manifest: Manifest, folder: Path) -> str:
     """What is wrong with the files of a model; empty when nothing is."""
-    files = {manifest.file: manifest.sha256, **{part.file: part.sha256 for part in manifest.parts.values()}}
-    for file, expected in files.items():
-        try:
-            found = file_hash(folder / file)
-        except InputError as error:
-            return f"the model {manifest.name} is incomplete: {error}; remove it and add it again"
-        if found != expected:
+    for file, expected in _files(manifest).items():
+        if file_hash(folder / file) != expected:
             return f"{folder / file} is not the file that was registered; remove the model and add it again"
     return ""

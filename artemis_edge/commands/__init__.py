@@ -1,0 +1,1 @@
+"""Commands of the command line by area; ``cli.py`` puts them together."""
