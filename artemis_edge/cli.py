@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from artemis_edge.commands import models
+from artemis_edge.commands import models, session
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -99,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
         _render,
         _export,
         _check,
-        _session,
+        session.add,
         models.add,
     ):
         add(commands)
@@ -230,14 +230,6 @@ def _check(commands: Any) -> None:
     parser = _command(commands, "check", run_check, "see whether this machine is ready")
     parser.add_argument("--config", type=Path, metavar="FILE", help="a configuration to check as well")
     _json_option(parser)
-
-
-def _session(commands: Any) -> None:
-    group = commands.add_parser("session", help="look into recordings")
-    kinds = group.add_subparsers(title="actions", metavar="ACTION", required=True)
-    info = _command(kinds, "info", run_session_info, "topics, counts and duration of a recording")
-    info.add_argument("session", type=Path, metavar="SESSION", help="a session, a bag or a data set")
-    _json_option(info)
 
 
 def _span(text: str) -> tuple[int, int | None]:
@@ -390,18 +382,6 @@ def run_check(given: argparse.Namespace) -> int:
     else:
         print(check.to_text(findings))
     return DONE if check.ready(findings) else FELL_SHORT
-
-
-def run_session_info(given: argparse.Namespace) -> int:
-    """``artemis-edge session info``."""
-    from artemis_edge.session import catalog
-
-    found = catalog.catalog(given.session)
-    if given.json:
-        _print_json(found.to_json())
-    else:
-        print(catalog.to_text(found))
-    return DONE
 
 
 if __name__ == "__main__":

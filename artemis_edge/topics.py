@@ -25,6 +25,20 @@ CAMERA_INFO = Topic("/camera/camera_info", "sensor_msgs/msg/CameraInfo", 0.0)
 TF = Topic("/tf", "tf2_msgs/msg/TFMessage", 10.0)
 TF_STATIC = Topic("/tf_static", "tf2_msgs/msg/TFMessage", 0.0)
 ODOMETRY = Topic("/odom", "nav_msgs/msg/Odometry", 10.0)
+RIG = Topic("/artemis/rig", "std_msgs/msg/String", 0.0)
+EVENTS = Topic("/artemis/events", "std_msgs/msg/String", 0.0)
+CLOCKS = Topic("/artemis/clocks", "std_msgs/msg/String", 1.0)
+HEALTH = Topic("/artemis/health", "std_msgs/msg/String", 1.0)
+LOST = Topic("/artemis/lost", "std_msgs/msg/String", 0.0)
+CAMERA_STAMP = Topic("/camera/frame_stamp", "std_msgs/msg/String", 10.0)
+LIDAR_PACKETS = Topic("/lidar/packets", "artemis_msgs/msg/RawPackets", 10.0)
+IMU_BYTES = Topic("/imu/bytes", "artemis_msgs/msg/RawPackets", 10.0)
+CAN_FRAMES = Topic("/can/frames", "artemis_msgs/msg/RawPackets", 10.0)
+
+RAW = LIDAR_PACKETS.ros_type
+
+#: What readers need before anything else: written again at the start of every further file of a session.
+LATCHED = frozenset({RIG.name, TF_STATIC.name})
 
 TOPICS = (
     LIDAR_POINTS,
@@ -37,4 +51,13 @@ TOPICS = (
     TF,
     TF_STATIC,
     ODOMETRY,
+    RIG,
+    EVENTS,
+    CLOCKS,
+    HEALTH,
+    LOST,
+    CAMERA_STAMP,
+    LIDAR_PACKETS,
+    IMU_BYTES,
+    CAN_FRAMES,
 )

@@ -155,7 +155,7 @@ def test_every_second_reaches_the_disk(tmp_path: Path, monkeypatch: pytest.Monke
     out = SessionWriter(path)
     for k in range(35):
         out.write_imu(k * SECOND // 10, np.zeros(3), np.zeros(3))
-    assert len(synced) == 3 and synced == sorted(set(synced))
+    assert len(synced) == 1 + 3 and synced == sorted(set(synced)), "once at the start, then every second"
     (tmp_path / "copy.mcap").write_bytes(path.read_bytes())
     out.close()
     with (tmp_path / "copy.mcap").open("rb") as stream:
@@ -203,13 +203,9 @@ def test_no_place_to_write(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_full_disk() -> None:
-    out = SessionWriter(Path("/dev/full"))
-    rng = np.random.default_rng(0)
     with pytest.raises(RunError, match="No space left on device") as caught:
-        for k in range(100):
-            out.write_image(k, rng.bytes(1 << 20))
+        SessionWriter(Path("/dev/full"))
     assert "\n" not in str(caught.value)
-    out.close()  # nothing more to say
 
 
 def test_disk_that_fails_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

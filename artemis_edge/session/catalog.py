@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ from artemis_edge.datasets.bag import Connection, Entry
 from artemis_edge.datasets.common import SECOND_NS
 from artemis_edge.datasets.rosbag import bag_files, open_bags
 from artemis_edge.errors import UserError
+
+_NEVER = " " * len("2026-01-01 00:00:00")
+_DATED_NS = 946_684_800 * SECOND_NS  # the year 2000: an earlier time is none, but counts from a start
 
 
 @dataclass(slots=True)
@@ -85,6 +89,24 @@ def catalog(path: Path) -> Catalog:
     return Catalog(
         source.name, size, topics, len(source), duration_s, has_poses, source.lost, source.warnings, None
     )
+
+
+def card(path: Path) -> dict[str, Any]:
+    """A recording in a list: name, when it was recorded, length, size, and a sentence if it cannot be read."""
+    files = bag_files(path)
+    found: dict[str, Any] = {"name": path.name, "path": str(path), "bytes": _size(files), "problem": None}
+    try:
+        topics = _topics(path)
+    except UserError as error:
+        return {**found, "recorded": _NEVER, "duration_s": 0.0, "messages": 0, "problem": str(error)}
+    first = min((topic.first_ns for topic in topics), default=0)
+    recorded = datetime.fromtimestamp(first / SECOND_NS, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    return {
+        **found,
+        "recorded": recorded if first > _DATED_NS else _NEVER,
+        "duration_s": round(_duration_s(topics), 3),
+        "messages": sum(topic.messages for topic in topics),
+    }
 
 
 def to_text(catalog: Catalog) -> str:

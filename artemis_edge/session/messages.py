@@ -284,6 +284,65 @@ class CameraExposure(Message):
 
 
 @dataclass(frozen=True, slots=True)
+class Text(Message):
+    """std_msgs/msg/String: a text, here always JSON."""
+
+    ROS_TYPE: ClassVar[str] = "std_msgs/msg/String"
+    text: str
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        cdr.string(self.text)
+        return cdr.finish()
+
+    @classmethod
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
+        return cls(cdr.string())
+
+
+@dataclass(frozen=True, slots=True)
+class RawPackets(Message):
+    """artemis_msgs/msg/RawPackets: what a device sent, byte for byte, one after the other in ``data``.
+
+    Of each packet ``receive_ns`` (n,) by the host's monotonic clock, ``id`` (n,) (of CAN frames; else 0), ``size``
+    (n,) in bytes. The header names the device.
+    """
+
+    ROS_TYPE: ClassVar[str] = "artemis_msgs/msg/RawPackets"
+    header: Header
+    receive_ns: NDArray[Any]
+    id: NDArray[Any]
+    size: NDArray[Any]
+    data: Buffer
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.sequence("q", self.receive_ns)
+        cdr.sequence("I", self.id)
+        cdr.sequence("I", self.size)
+        cdr.write("I", len(self.data))
+        cdr.octets(self.data)
+        return cdr.finish()
+
+    @classmethod
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
+        header, receive = Header.read(cdr), cdr.sequence("q")
+        ids, size = cdr.sequence("I"), cdr.sequence("I")
+        return cls(header, receive, ids, size, cdr.octets(cdr.read("I")))
+
+    def packets(self) -> list[bytes]:
+        """The packets one by one."""
+        ends = np.cumsum(self.size, dtype=np.int64).tolist()
+        starts = [0, *ends[:-1]]
+        return [bytes(self.data[a:b]) for a, b in zip(starts, ends, strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
 class CameraInfo(Message):
     """sensor_msgs/msg/CameraInfo: ``k`` (9,), ``r`` (9,), ``p`` (12,) row-major, ``d`` of the model."""
 

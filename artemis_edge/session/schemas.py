@@ -48,6 +48,10 @@ _DEFINITIONS = {
         "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n"
         "sensor_msgs/RegionOfInterest roi\n"
     ),
+    "std_msgs/String": "string data\n",
+    "artemis_msgs/RawPackets": (
+        "std_msgs/Header header\nint64[] receive_ns\nuint32[] id\nuint32[] size\nuint8[] data\n"
+    ),
     "artemis_msgs/CameraExposure": "std_msgs/Header header\nfloat64 exposure_s\nfloat64 gain\n",
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
     "nav_msgs/Odometry": (

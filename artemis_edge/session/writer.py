@@ -24,6 +24,7 @@ from mcap.writer import CompressionType, Writer
 from artemis_edge import topics
 from artemis_edge.errors import RunError
 from artemis_edge.frames import F32, F64, U8, CameraModel
+from artemis_edge.session.cdr import Buffer
 from artemis_edge.session.messages import (
     FIELD_TYPES,
     CameraExposure,
@@ -56,6 +57,7 @@ POINT = np.dtype(
     ]
 )
 _SECOND_NS = 1_000_000_000
+_SEQUENCES = 2**32  # MCAP numbers messages by a uint32
 
 
 class SessionWriter:
@@ -80,7 +82,7 @@ class SessionWriter:
         self._last_sync_ns: int | None = None
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, tuple[int, str]] = {}
-        self._sequence: dict[int, int] = {}
+        self._sequence: dict[str, int] = {}
         self._file = self._open()
         self._mcap = Writer(self._file, CHUNK_BYTES, CompressionType.LZ4)
         self._guard(lambda: self._start(attachments or {}, metadata or {}))
@@ -258,6 +260,16 @@ class SessionWriter:
         receive_ns = stamp_ns if receive_ns is None else receive_ns
         self._guard(lambda: self._add(topic, message, stamp_ns, receive_ns))
 
+    def write_encoded(
+        self, topic: str, ros_type: str, data: Buffer, stamp_ns: int, receive_ns: int, sequence: int
+    ) -> None:
+        """A message that is encoded already, with a sequence number of the caller's; whoever calls it also flushes."""
+        self._guard(lambda: self._put(topic, ros_type, data, stamp_ns, receive_ns, sequence))
+
+    def position(self) -> int:
+        """Bytes of the file that are complete; what is in the open chunk comes on top."""
+        return 0 if self._file.closed else self._file.tell()
+
     def flush(self) -> None:
         """Close the open chunk and push it to the disk."""
         self._guard(self._sync)
@@ -285,12 +297,18 @@ class SessionWriter:
             self._mcap.add_attachment(0, 0, name, media, data)
         for name, record in metadata.items():
             self._mcap.add_metadata(name, dict(record))
+        self._sync()
+
+    def _put(
+        self, topic: str, ros_type: str, data: Buffer, stamp_ns: int, receive_ns: int, sequence: int
+    ) -> None:
+        channel = self._channel(topic, ros_type)
+        self._mcap.add_message(channel, receive_ns, data, stamp_ns, sequence % _SEQUENCES)
 
     def _add(self, topic: str, message: Message, stamp_ns: int, receive_ns: int) -> None:
-        channel = self._channel(topic, message.ROS_TYPE)
-        sequence = self._sequence.get(channel, 0)
-        self._sequence[channel] = sequence + 1
-        self._mcap.add_message(channel, receive_ns, message.encode(), stamp_ns, sequence)
+        sequence = self._sequence.get(topic, 0)
+        self._sequence[topic] = sequence + 1
+        self._put(topic, message.ROS_TYPE, message.encode(), stamp_ns, receive_ns, sequence)
         if self._last_sync_ns is None:
             self._last_sync_ns = receive_ns
         elif receive_ns - self._last_sync_ns >= self._sync_every_ns:
