@@ -73,7 +73,7 @@ def _nouns(synonyms: dict[str, list[str]], kinds: dict[str, list[str]], more: li
 def canonical(name: str) -> str:
     """The canonical name of a class, as a model or a person spells it; unknown words in singular, lower case."""
     spelled = " ".join(name.lower().replace("_", " ").split())
-    return vocabulary().find(spelled) or spelled
+    return vocabulary().find(spelled) or singular(spelled)
 
 
 def singular(word: str) -> str:
