@@ -146,7 +146,7 @@ def _simulate(commands: Any) -> None:
     parser.add_argument(
         "world",
         metavar="WORLD",
-        help="street, courtyard, hall, corridor, facade, or a .glb, .gltf or .obj file",
+        help="street, courtyard, hall, corridor, facade, bench, or a .glb, .gltf or .obj file",
     )
     parser.add_argument("--seed", type=int, default=_SEED, help="which of its variants (default: 1)")
     parser.add_argument("--seconds", type=float, default=_SIMULATED_SECONDS, help="length (default: 20)")

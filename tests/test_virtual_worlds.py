@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 import pytest
-from artemis_drivers.virtual import corridor, courtyard, hall, route, street
+from artemis_drivers.virtual import bench, corridor, courtyard, hall, route, street
 from artemis_drivers.virtual import movers as moving_things
 from artemis_drivers.virtual.catalogue import worlds
 from artemis_drivers.virtual.mesh_builder import CLASS_NAMES, F64, MeshBuilder, WorldMesh
@@ -24,6 +24,7 @@ MUST_HAVE = {
     "hall": {"steps", "pillar", "shelf", "glass", "railing", "person", "table", "chair"},
     "corridor": set(),
     "facade": set(),
+    "bench": {"person", "bench", "backpack", "tree", "hedge"},
 }
 
 
@@ -172,6 +173,21 @@ def test_walkers_legs_swing_against_each_other_below_the_hip() -> None:
     assert -0.03 < lowest.min() < 0.1
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_person_backpack_and_bench_touch(seed: int) -> None:
+    m = mesh("bench", seed)
+    corners = m.corners().astype(np.float64)
+    centre = corners[:, :, :2].mean(axis=1)
+    near = {
+        name: corners[(m.class_id == CLASS_NAMES.index(name)) & (np.linalg.norm(centre, axis=1) < 1.2)]
+        for name in ("person", "backpack", "bench")
+    }
+    points = np.unique(near["backpack"].reshape(-1, 3), axis=0)
+    for other in ("person", "bench"):
+        gap = min(float(distances(p, near[other]).min()) for p in points)
+        assert gap < 0.03, f"{other} is {gap:.3f} m from the backpack"
+
+
 def test_motion_along_goes_there_and_back_or_round() -> None:
     line = np.array([[0.0, 0, 0], [10.0, 0, 0]])
     there = route.motion_along(line, 1.0, 30.0)
@@ -299,7 +315,7 @@ def test_no_world_uses_a_material_that_it_leaves_out(monkeypatch: pytest.MonkeyP
             whole.arrays, {n: k for n, k in whole.index.items() if not n.startswith(leave_out)}
         )
 
-    for module in (corridor, courtyard, hall, street):
+    for module in (bench, corridor, courtyard, hall, street):
         monkeypatch.setattr(module, "build_atlas", lacking)
     for name, make in worlds().items():
         for seed in range(40, 44):

@@ -196,6 +196,14 @@ class VirtualCamera:
             data, encoding = encode_jpeg(developed(raw, self.spec.sensor), self.spec.jpeg_quality), "jpeg"
         return Photo(data, encoding, used.exposure_s, used.gain)
 
+    def seen(self) -> tuple[I32, F32]:
+        """Of the picture taken last: int32 (h, w, 4) numbers of the triangles in the quarters of each pixel, -1
+        the sky, and float32 (h, w) depth in metres along z, inf the sky; in the middle of the exposure.
+        """
+        shape = self.spec.height, self.spec.width
+        triangles: I32 = self._canvas.triangle.reshape(-1)[self.sub_pixels]
+        return triangles, self._film.depth.reshape(shape).copy()
+
     def _raw(
         self, scene: Scene, parts: Parts, path: CameraPath, time_s: float, used: Exposure, index: int
     ) -> np.ndarray[tuple[int, int], np.dtype[np.uint16]]:

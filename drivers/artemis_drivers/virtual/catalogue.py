@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from artemis_drivers.virtual import corridor, courtyard, hall, loaded, street
+from artemis_drivers.virtual import bench, corridor, courtyard, hall, loaded, street
 from artemis_drivers.virtual.textures import TextureAtlas
 from artemis_drivers.virtual.world import World
 
@@ -24,6 +24,7 @@ def worlds() -> dict[str, BuildWorld]:
         "hall": hall.build,
         "corridor": corridor.build_corridor,
         "facade": corridor.build_facade,
+        "bench": bench.build,
     }
 
 
