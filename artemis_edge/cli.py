@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from artemis_edge.commands import models, session
+from artemis_edge.commands import models, rig, session
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -101,6 +101,7 @@ def _parser() -> argparse.ArgumentParser:
         _check,
         session.add,
         models.add,
+        rig.add,
     ):
         add(commands)
     return parser
