@@ -366,7 +366,7 @@ def remove_block(store: Store, block: int) -> None:
         store.free_voxel[store.counter[FREE_VOXELS]] = v
         store.counter[FREE_VOXELS] += 1
     row = store.block[block]
-    _remove_key(
+    remove_key(
         store.hash_key, store.hash_slot, find_slot(store.hash_key, block_key(row[BX], row[BY], row[BZ]))
     )
     store.block[block, SEEN] = -1
@@ -376,7 +376,7 @@ def remove_block(store: Store, block: int) -> None:
 
 
 @kernel
-def _remove_key(hash_key: I64, hash_slot: I32, hole: int) -> None:
+def remove_key(hash_key: I64, hash_slot: I32, hole: int) -> None:
     """Empty a place and move later keys of the run back (Knuth 6.4, algorithm R)."""
     mask = hash_key.shape[0] - 1
     at = hole

@@ -212,6 +212,64 @@ class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = ""
 
 
+class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """Texture from photographs, weighed by reliability (section III-C, refinement/)."""
+
+    enabled: Annotated[bool, Meta(description="Whether images colour the map.")] = True
+    sigma_photo: Annotated[
+        float,
+        _float("Colour difference that halves trust, about (eq. 9) [grey levels].", ge=0.1, le=1e6),
+    ] = 40.0
+    sigma_geom: Annotated[
+        float,
+        _float("Distance in front of a surface that halves trust (eq. 9) [share of it].", ge=1e-4, le=1e6),
+    ] = 0.02
+    least_reliability: Annotated[
+        float, _float("Observations of less reliability W are discarded.", ge=0.001, le=0.999)
+    ] = 0.1
+    noise: Annotated[
+        float,
+        _float(
+            "How colours of one place differ between good images, 1 sigma [grey levels].", ge=0.1, le=255.0
+        ),
+    ] = 20.0
+    most_information: Annotated[
+        float, _float("Good observations that a colour remembers at most.", ge=1.0, le=63.0)
+    ] = 16.0
+    forget: Annotated[
+        float, _float("Share of its information that a contradicted colour loses.", ge=0.0, le=0.9)
+    ] = 0.2
+    least_cosine: Annotated[
+        float,
+        _float("Surfaces seen at a smaller cosine of the viewing angle are left alone.", ge=0.01, le=0.99),
+    ] = 0.04
+    range_m: Annotated[
+        float, _float("Surfaces farther than this are not coloured [m].", ge=1.0, le=1000.0)
+    ] = 80.0
+    texel_px: Annotated[
+        float, _float("Edge of a texel in pixels of the closest image.", ge=0.25, le=64.0)
+    ] = 1.0
+    finest_texel_m: Annotated[float, _float("Texels are never smaller than this [m].", ge=0.001, le=1.0)] = (
+        0.00625
+    )
+    texel_share: Annotated[
+        float, _float("Share of the map's memory that texels may take.", ge=0.05, le=0.9)
+    ] = 0.6
+    share: Annotated[
+        float, _float("Share of the surface in view that one image colours.", ge=0.01, le=1.0)
+    ] = 1.0
+    wait_frames: Annotated[
+        int, Meta(description="Frames after which an image is used, if its surface is meshed.", ge=0, le=1000)
+    ] = 6
+    patience_frames: Annotated[
+        int, Meta(description="Frames after which it is used in any case.", ge=0, le=10_000)
+    ] = 50
+    keyframes: Annotated[
+        int,
+        Meta(description="Images kept for what is meshed after they were used.", ge=0, le=10_000),
+    ] = 150
+
+
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole configuration: one section a stage."""
 
@@ -219,6 +277,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     odometry: OdometryConfig = OdometryConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     mesher: MesherConfig = MesherConfig()
+    refinement: RefinementConfig = RefinementConfig()
 
 
 def load(file: Path | None = None, profile: str | None = None, sets: Iterable[str] = ()) -> Config:

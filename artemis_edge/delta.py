@@ -11,7 +11,9 @@ from artemis_edge.block_store import (
     ALIVE,
     BX,
     CHANGED,
+    COLOUR,
     COUNT,
+    INFORMATION,
     IX,
     IY,
     IZ,
@@ -24,7 +26,7 @@ from artemis_edge.block_store import (
     block_key,
     lowest_bit,
 )
-from artemis_edge.frames import F32, I32, I64, MeshDelta
+from artemis_edge.frames import F32, I32, I64, U8, MeshDelta
 from artemis_edge.paging import EAR_MASK
 
 # Blocks told a frame at most: the pipeline's time stays bounded. What waits is told in its newest state
@@ -143,6 +145,17 @@ def copy_vertices(store: Store, cells: I32, position: F32, normal: F32, hits: F3
 
 
 @kernel
+def read_colours(store: Store, cells: I32, colour: U8) -> None:
+    """Mean colours of the vertices in ``cells``, GREY where no camera has seen them."""
+    known = store.attribute.shape[1] > INFORMATION
+    for i in range(cells.shape[0]):
+        for k in range(3):
+            colour[i, k] = GREY
+            if known and store.attribute[cells[i], INFORMATION] > 0.0:
+                colour[i, k] = int(min(max(store.attribute[cells[i], COLOUR + k] + 0.5, 0.0), 255.0))
+
+
+@kernel
 def copy_triangles(store: Store, voxels: I32, triangles: I64) -> None:
     """Vertex names of the triangles of ``voxels``, (t, 3)."""
     j = 0
@@ -208,12 +221,13 @@ def to_delta(index: int, store: Store, slots: I32, listing: Listing) -> MeshDelt
         vertex_id=listing.name[:n].copy(),
         position=np.empty((n, 3), np.float32),
         normal=np.empty((n, 3), np.float32),
-        colour=np.full((n, 3), GREY, np.uint8),
+        colour=np.empty((n, 3), np.uint8),
         label=np.zeros(n, np.uint8),
         confidence=np.empty(n, np.float32),
         triangles=np.empty((int(triangle_start[-1]), 3), np.int64),
     )
     copy_vertices(store, listing.cell[:n], delta.position, delta.normal, delta.confidence)
+    read_colours(store, listing.cell[:n], delta.colour)
     sureness(delta.confidence)
     copy_triangles(store, listing.voxel[: voxel_start[-1]], delta.triangles)
     return delta

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from artemis_edge.block_store import NORMAL, POSITION
+from artemis_edge.block_store import COLOUR, INFORMATION, NORMAL, POSITION
 from artemis_edge.config import Config, to_toml
 from artemis_edge.delta import GREY, confidence
 from artemis_edge.export.atomic import replacing, write_bytes
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.export.ply import write_ply
 from artemis_edge.finishing import finish
-from artemis_edge.frames import F32, I32, I64
+from artemis_edge.frames import F32, I32, I64, U8
 from artemis_edge.paging import Pager, page_bytes
 
 LABELS = {0: "background"}
@@ -29,7 +29,7 @@ def gather_mesh(pager: Pager, longest_m: float, smallest_island: int) -> Mesh:
     order = np.argsort(vertex_id)
     faces = _join(vertex_id, order, triangle_ids)
     del triangle_ids
-    position, normal, sure = _attributes(pager, len(vertex_id))
+    position, normal, sure, colour = _attributes(pager, len(vertex_id))
     faces = finish(position, normal, faces, longest_m, smallest_island)
     used = np.zeros(len(vertex_id), bool)
     used[faces] = True
@@ -38,7 +38,7 @@ def gather_mesh(pager: Pager, longest_m: float, smallest_island: int) -> Mesh:
     return Mesh(
         vertices=position[used],
         normals=normal[used],
-        colours=np.full((n, 3), GREY, np.uint8),
+        colours=colour[used],
         labels=np.zeros(n, np.uint8),
         confidence=sure[used],
         faces=renumber[faces],
@@ -57,10 +57,10 @@ def _join(vertex_id: I64, order: I64, triangle_ids: list[I64]) -> I32:
     return np.concatenate(out) if out else np.empty((0, 3), np.int32)
 
 
-def _attributes(pager: Pager, n: int) -> tuple[F32, F32, F32]:
-    """Position (n, 3), normal (n, 3) and confidence (n,) of all living vertices, in order of pages."""
+def _attributes(pager: Pager, n: int) -> tuple[F32, F32, F32, U8]:
+    """Position (n, 3), normal (n, 3), confidence (n,) and colour (n, 3) of all living vertices, in order of pages."""
     position, normal = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
-    sure = np.empty(n, np.float32)
+    sure, colour = np.empty(n, np.float32), np.full((n, 3), GREY, np.uint8)
     row = 0
     for page in pager.pages():
         alive = page.alive()
@@ -68,8 +68,16 @@ def _attributes(pager: Pager, n: int) -> tuple[F32, F32, F32]:
         position[rows] = page.vertex[alive, POSITION : POSITION + 3]
         normal[rows] = page.vertex[alive, NORMAL : NORMAL + 3]
         sure[rows] = confidence(page.evidence[alive])
+        _colour_into(colour[rows], page.attribute[alive])
         row = rows.stop
-    return position, normal, sure
+    return position, normal, sure, colour
+
+
+def _colour_into(colour: U8, attribute: F32) -> None:
+    """Mean colours (n, 3) of vertices that a camera has seen; the others stay."""
+    if attribute.shape[1] > INFORMATION:
+        seen = attribute[:, INFORMATION] > 0.0
+        colour[seen] = (attribute[seen, COLOUR : COLOUR + 3] + 0.5).clip(0, 255)
 
 
 def write_mesh(path: Path, pager: Pager, longest_m: float, smallest_island: int) -> Mesh:

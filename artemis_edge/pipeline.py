@@ -15,6 +15,7 @@ from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame
 from artemis_edge.map_writer import save_map, write_mesh
 from artemis_edge.mesher import Mesher
 from artemis_edge.paging import TIGHT, Pager
+from artemis_edge.refinement.stage import Refinement
 from artemis_edge.visibility import FreeSpace
 from artemis_edge.voxel_map import VoxelMap
 
@@ -32,6 +33,12 @@ class Pipeline:
         self.free_space = FreeSpace(config.voxel_map, self.voxel_map)
         self.pager = Pager(self.voxel_map.store, page_folder)
         self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.prepare)
+        self.refinement = Refinement(
+            config.refinement,
+            self.voxel_map,
+            (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6,
+            page_folder,
+        )
         self.outbox = Outbox(self.voxel_map.store)
         self.trajectory: list[tuple[int, F64]] = []
         self.stage_ms: dict[str, float] = {}
@@ -50,6 +57,8 @@ class Pipeline:
             self.free_space.carve(tracked, self._stamp)
         with self._stage("mesher"):
             self.mesher.update(active, self._stamp)
+        with self._stage("refinement"):
+            self.refinement.update(tracked, self._stamp)
         with self._stage("delta"):
             # what goes to disk must have been told
             tight = self.pager.fill() >= TIGHT
@@ -63,6 +72,8 @@ class Pipeline:
         self.stage_ms = {}
         with self._stage("mesher"):
             self.mesher.flush(self._stamp)
+        with self._stage("refinement"):
+            self.refinement.finish()
         with self._stage("delta"):
             return self.outbox.everything(self._stamp)
 
@@ -74,7 +85,7 @@ class Pipeline:
             "patches_without_memory": self.mesher.refused,
             "blocks_without_memory": self.pager.left_on_disk,
         }
-        return {reason: n for reason, n in counts.items() if n}
+        return {**{reason: n for reason, n in counts.items() if n}, **self.refinement.lost}
 
     def write_mesh(self, path: Path) -> Mesh:
         """Write ``mesh.ply``, finished, and return the mesh."""

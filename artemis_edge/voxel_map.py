@@ -72,7 +72,7 @@ class VoxelMap:
         self.config = config
         self.cell_m = config.voxel_m / bs.CELLS_PER_VOXEL
         self.block_m = config.voxel_m * bs.VOXELS_PER_BLOCK
-        self.store = bs.allocate(budget_bytes)
+        self.store = bs.allocate(budget_bytes, bs.LOG_CLASS)
         self._touched = np.empty(self.store.voxel.shape[0], np.int32)
         self._insert_rules = InsertRules(
             self.cell_m, config.min_range_m, config.max_range_m, config.noise_range_m

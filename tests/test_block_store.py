@@ -66,7 +66,7 @@ def test_removal_keeps_runs_of_colliding_keys_reachable(steps: list[tuple[bool, 
             twin[key] = which
         elif key in twin:
             del twin[key]
-            bs._remove_key(hash_key, hash_slot, at)
+            bs.remove_key(hash_key, hash_slot, at)
         found = {
             k: int(hash_slot[bs.find_slot(hash_key, k)])
             for k in keys

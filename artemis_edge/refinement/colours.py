@@ -1,0 +1,67 @@
+"""The colour state of vertices, and the gain that brings an image's exposure to that of the map."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from artemis_edge._jit import kernel
+from artemis_edge.block_store import COLOUR, INFORMATION, Store
+from artemis_edge.frames import F32, F64
+from artemis_edge.refinement.reliability import Observations, Trust, exposure_weight, photometric
+
+# Vertices that an image must share with the map before their colours tell its exposure
+_LEAST_COMMON = 50
+# Of so many the median is taken: its error is then below half a per cent for colours that scatter by 20 %
+_MOST_COMMON = 4000
+# Levels between which a pixel is in proportion to the light
+_DARK, _BRIGHT = 12.0, 245.0
+# A camera's exposure does not step further than this between images that can be compared
+_LARGEST_GAIN = 8.0
+
+
+def estimate_gain(store: Store, seen: Observations, trust: Trust) -> F32:
+    """Factor per channel, float32 (3,), from the colours of an image as taken to those of the map.
+
+    The median over the vertices both know: people who walk through and highlights do not move it. Ones where image
+    and map have too little in common.
+    """
+    known = store.attribute[seen.slot, INFORMATION] * trust.noise2 >= 0.5
+    rows = np.flatnonzero(known & (seen.geometric > 0.5))
+    mean = store.attribute[seen.slot[rows], COLOUR : COLOUR + 3]
+    colour = seen.colour[rows]
+    usable = ((colour > _DARK) & (colour < _BRIGHT) & (mean > _DARK) & (mean < _BRIGHT)).all(axis=1)
+    if np.count_nonzero(usable) < _LEAST_COMMON:
+        return np.ones(3, np.float32)
+    mean, colour = mean[usable], colour[usable]
+    every = -(-len(mean) // _MOST_COMMON)
+    gain: F64 = np.median(mean[::every] / colour[::every], axis=0)
+    within: F32 = gain.clip(1.0 / _LARGEST_GAIN, _LARGEST_GAIN).astype(np.float32)
+    return within
+
+
+@kernel
+def update_vertices(store: Store, seen: Observations, size: float, sharpness: float, trust: Trust) -> None:
+    """Bayesian update of the vertices' colours (mu, Sigma), modulated by W.
+
+    The variance of an observation is ``trust.noise2`` over its weight: W, how sharply the image resolves ``size``
+    pixels times metres (focal length times the vertices' spacing), motion blur, clipping. A contradicted colour
+    loses a share of its information.
+    """
+    for i in range(seen.slot.shape[0]):
+        m, c = store.attribute[seen.slot[i]], seen.colour[i]
+        g = np.float64(seen.geometric[i])
+        quality = min(size * seen.cosine[i] / seen.depth[i], 1.0)
+        quality *= quality * sharpness * exposure_weight(c[0], c[1], c[2])
+        information = np.float64(m[INFORMATION]) * trust.noise2
+        dr, dg, db = c[0] - m[COLOUR], c[1] - m[COLOUR + 1], c[2] - m[COLOUR + 2]
+        p = photometric(np.float64(dr) * dr + np.float64(dg) * dg + np.float64(db) * db, information, trust)
+        w = g * p
+        if w >= trust.least and quality > 0.0:
+            w *= quality
+            gain = w / (information + w)
+            m[COLOUR] += gain * dr
+            m[COLOUR + 1] += gain * dg
+            m[COLOUR + 2] += gain * db
+            information += w
+        information *= 1.0 - trust.forget * (1.0 - p) * g * quality
+        m[INFORMATION] = min(information, trust.most) / trust.noise2

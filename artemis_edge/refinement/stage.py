@@ -1,0 +1,126 @@
+"""The stage of the pipeline that colours the map: images wait until their surface is meshed, then are fused."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from artemis_edge.config import RefinementConfig
+from artemis_edge.frames import F64, CameraImage, TrackedFrame
+from artemis_edge.refinement import texels as tx
+from artemis_edge.refinement.colours import update_vertices
+from artemis_edge.refinement.painting import new_brush, paint
+from artemis_edge.refinement.photographs import Keyframes, Refused, Waiting, arrivals, decode
+from artemis_edge.refinement.reliability import Trust
+from artemis_edge.refinement.view import Viewer
+from artemis_edge.voxel_map import VoxelMap
+
+# Of the voxels in view, that may still wait for their first patch when an image is used
+_UNMESHED = 0.1
+_EVERYTHING = 1 << 16  # more than any texel's information as stored
+_LITTLE = 0.25  # good observations, below which keyframes are asked again
+_PARTS = 64  # of the surface, by which ``share`` is told
+
+
+def trust_of(config: RefinementConfig) -> Trust:
+    """The configuration's part that kernels take."""
+    return Trust(
+        config.sigma_photo,
+        config.sigma_geom,
+        config.least_reliability,
+        config.noise * config.noise,
+        config.most_information,
+        config.forget,
+        config.least_cosine,
+    )
+
+
+class Refinement:
+    """Colours vertices and texels with the images of the frames.
+
+    ``share`` (0..1] of the surface in view is coloured by each image; the overload control lowers it.
+    """
+
+    def __init__(
+        self, config: RefinementConfig, voxel_map: VoxelMap, budget_bytes: float, folder: Path
+    ) -> None:
+        self.share = config.share
+        self.refused = Refused()
+        self.keyframes = Keyframes(folder, config.keyframes)
+        self.texels = tx.allocate(config.texel_share * budget_bytes)
+        self.trust = trust_of(config)
+        self.viewer = Viewer(voxel_map.store, voxel_map.config.voxel_m, config.range_m, self.trust)
+        self._config, self._map = config, voxel_map
+        self._brush = new_brush(voxel_map.config.voxel_m, config.texel_px, config.finest_texel_m)
+        self._waiting: deque[Waiting] = deque()
+        self._looks = 0
+
+    def update(self, frame: TrackedFrame, stamp: int) -> None:
+        """Take the images of a frame and use those whose turn has come."""
+        self._waiting.extend(arrivals(frame, stamp, self.refused))
+        most = 2 * max(len(frame.images), 1)  # of those that waited, so that one frame never pays for many
+        while self._waiting and most > 0 and self._is_due(self._waiting[0], stamp):
+            waiting = self._waiting.popleft()
+            self.keyframes.offer(waiting)
+            self._fuse(waiting, _EVERYTHING)
+            most -= 1
+
+    def finish(self) -> None:
+        """Use all images that wait; then give what was meshed late its colour from the keyframes."""
+        unseen = int(_LITTLE * tx.INFORMATION_SCALE)
+        before = len(self.keyframes)
+        while self._waiting:
+            self._fuse(self._waiting.popleft(), _EVERYTHING)
+        for k in range(before):
+            self._fuse(self.keyframes.get(k), unseen)
+
+    @property
+    def lost(self) -> Mapping[str, int]:
+        """Images and texels that could not be used, by reason."""
+        refused = int(self.texels.counter[tx.REFUSED])
+        return {**self.refused.count, **({"texels_without_memory": refused} if refused else {})}
+
+    def _is_due(self, waiting: Waiting, stamp: int) -> bool:
+        age = stamp - waiting.stamp
+        if age >= self._config.patience_frames:
+            return True
+        if age < self._config.wait_frames:
+            return False
+        return self.viewer.unmeshed_share(waiting.image.model, waiting.T_world_cam) <= _UNMESHED
+
+    def _fuse(self, waiting: Waiting, enough: int) -> None:
+        pixels = decode(waiting.image, self.refused)
+        if pixels is None:
+            return
+        self._looks += 1
+        model = waiting.image.model
+        view = self.viewer.look(pixels, model, waiting.T_world_cam, sharpness(waiting.image, waiting.twist))
+        view = self.viewer.weigh(view)
+        store, voxel_m = self._map.store, self._map.config.voxel_m
+        if enough == _EVERYTHING:
+            spacing = model.fx * voxel_m / 4
+            update_vertices(store, view.seen, spacing, view.photo.sharpness, self.trust)
+        paint(
+            self.texels,
+            view.visible,
+            store.vertex,
+            view.photo,
+            self.trust,
+            self._brush,
+            self._looks,
+            max(round(self.share * _PARTS), 1),
+            enough,
+        )
+
+
+def sharpness(image: CameraImage, twist: F64) -> float:
+    """Weight of an image by its motion blur, 0..1: one over the squared length of the smear in pixels.
+
+    A pixel that mixes n pixels in a row tells as much as 1 / n of one, and what it tells is displaced as well; the
+    turn rate of the body counts, since nearby things smear most by turning. Unknown exposure: no blur.
+    """
+    smear_px = float(np.linalg.norm(twist[3:])) * max(image.exposure_s, 0.0) * image.model.fx
+    return 1.0 / max(smear_px, 1.0) ** 2

@@ -1,0 +1,61 @@
+"""One photograph as the map sees it: what it shows, how deep, and how reliably. Shared by texture and semantics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from artemis_edge.block_store import Store
+from artemis_edge.frames import F64, U8, CameraModel
+from artemis_edge.refinement.camera import Camera, make_camera, view_bounds
+from artemis_edge.refinement.colours import estimate_gain
+from artemis_edge.refinement.reliability import Observations, Photo, Trust, observe, weigh
+from artemis_edge.refinement.visible import Visible, depth_map, list_visible, new_visible, unmeshed
+
+_DEPTH_WIDTH = 320  # pixels of the reference depth map, about: finer ones lose nothing that matters
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """``visible`` lists vertices and triangles in the frustum (scratch: valid until the next view), ``photo`` holds
+    image, camera and reference depth map, ``seen`` the observations of vertices with their W.
+    """
+
+    visible: Visible
+    photo: Photo
+    seen: Observations
+
+
+class Viewer:
+    """Makes views of a map. Keeps the scratch memory and what each camera model needs once."""
+
+    def __init__(self, store: Store, voxel_m: float, far_m: float, trust: Trust) -> None:
+        self._store, self._voxel_m, self._far_m, self.trust = store, voxel_m, far_m, trust
+        self._visible = new_visible(store)
+        self._bounds: dict[CameraModel, tuple[float, float, float, float]] = {}
+
+    def unmeshed_share(self, model: CameraModel, T_world_cam: F64) -> float:
+        """Share of the voxels in view that wait for their first patch; 1 where no voxel is in view."""
+        camera = self._camera(model, T_world_cam)
+        return float(unmeshed(self._store, camera, self._voxel_m, self._far_m))
+
+    def look(self, image: U8, model: CameraModel, T_world_cam: F64, sharpness: float = 1.0) -> View:
+        """View of ``image`` uint8 (h, w, 3) RGB taken at ``T_world_cam`` (4, 4) with the map as it is now."""
+        camera = self._camera(model, T_world_cam)
+        self._visible = list_visible(self._store, camera, self._voxel_m, self._far_m, self._visible)
+        depth = depth_map(self._visible, camera, max(round(model.width / _DEPTH_WIDTH), 1))
+        photo = Photo(camera, image, depth, np.ones(3, np.float32), sharpness)
+        seen = observe(self._store, self._visible, photo, self.trust)
+        return View(self._visible, photo, seen)
+
+    def weigh(self, view: View) -> View:
+        """Bring the image to the map's exposure and fill W (eq. 9)."""
+        gain = estimate_gain(self._store, view.seen, self.trust)
+        weigh(self._store, view.seen, gain, self.trust)
+        return View(view.visible, view.photo._replace(gain=gain), view.seen)
+
+    def _camera(self, model: CameraModel, T_world_cam: F64) -> Camera:
+        if model not in self._bounds:
+            self._bounds[model] = view_bounds(model)
+        return make_camera(model, T_world_cam, self._bounds[model])
