@@ -90,14 +90,14 @@ def _from_rows(rows: F32, wanted: I64, least: float) -> Candidates:
 def _from_heads(outputs: Mapping[str, Array], wanted: I64, least: float) -> Candidates:
     parts = []
     for stride in STRIDES:
-        logits = outputs[f"cls{stride}"][0][wanted]
-        _, high, wide = logits.shape
-        column, anchor = np.nonzero(logits.reshape(len(wanted), -1) >= _logit(least))
-        edges = outputs[f"box{stride}"][0].reshape(_EDGES, _BINS, -1)[:, :, anchor]
+        _, high, wide = outputs[f"cls{stride}"][0].shape
+        logits = outputs[f"cls{stride}"][0][wanted].reshape(len(wanted), high * wide)
+        column, anchor = np.nonzero(logits >= _logit(least))
+        edges = outputs[f"box{stride}"][0].reshape(_EDGES, _BINS, high * wide)[:, :, anchor]
         centre = np.stack([anchor % wide, anchor // wide], axis=1) + 0.5
         reach = _mean_bin(np.asarray(edges, np.float32))
         box = np.concatenate([centre - reach[:, :2], centre + reach[:, 2:]], axis=1) * stride
-        score = sigmoid(logits.reshape(len(wanted), -1)[column, anchor])
+        score = sigmoid(logits[column, anchor])
         coefficients = outputs[f"coef{stride}"][0].reshape(MASKS, high * wide)[:, anchor].T
         parts.append((box, score, column, coefficients))
     box, score, column, coefficients = (np.concatenate(items) for items in zip(*parts, strict=True))
