@@ -255,6 +255,9 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
     texel_share: Annotated[
         float, _float("Share of the map's memory that texels may take.", ge=0.05, le=0.9)
     ] = 0.6
+    atlas_megatexels: Annotated[
+        float, _float("Texels of the finished mesh's atlas at most [millions].", ge=0.1, le=4096.0)
+    ] = 128.0
     share: Annotated[
         float, _float("Share of the surface in view that one image colours.", ge=0.01, le=1.0)
     ] = 1.0

@@ -10,6 +10,7 @@ from pathlib import Path
 from artemis_edge.block_store import REFUSED_POINTS
 from artemis_edge.config import Config
 from artemis_edge.delta import Outbox
+from artemis_edge.export.atlas import write_atlas
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame
 from artemis_edge.map_writer import save_map, write_mesh
@@ -43,6 +44,7 @@ class Pipeline:
         self.trajectory: list[tuple[int, F64]] = []
         self.stage_ms: dict[str, float] = {}
         self._stamp = 0
+        self._mesh: Mesh | None = None
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
         """All stages for one frame."""
@@ -90,11 +92,15 @@ class Pipeline:
     def write_mesh(self, path: Path) -> Mesh:
         """Write ``mesh.ply``, finished, and return the mesh."""
         rules = self.config.mesher
-        return write_mesh(path, self.pager, rules.long_edge * self.voxel_map.cell_m, rules.smallest_island)
+        longest_m = rules.long_edge * self.voxel_map.cell_m
+        self._mesh = write_mesh(path, self.pager, longest_m, rules.smallest_island)
+        return self._mesh
 
     def save(self, folder: Path) -> int:
         """Write what reopens the map; returns its size in bytes."""
         size = save_map(folder, self.pager, self.config)
+        if self._mesh is not None:
+            size += write_atlas(folder, self.refinement.atlas(self._mesh))
         self.pager.file.close()
         return size
 

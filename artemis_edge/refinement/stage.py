@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from artemis_edge.config import RefinementConfig
+from artemis_edge.export.atlas import Atlas
+from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F64, CameraImage, TrackedFrame
 from artemis_edge.refinement import texels as tx
+from artemis_edge.refinement.atlas_builder import build_atlas
 from artemis_edge.refinement.colours import update_vertices
 from artemis_edge.refinement.painting import new_brush, paint
 from artemis_edge.refinement.photographs import Keyframes, Refused, Waiting, arrivals, decode
@@ -76,6 +79,11 @@ class Refinement:
             self._fuse(self._waiting.popleft(), _EVERYTHING)
         for k in range(before):
             self._fuse(self.keyframes.get(k), unseen)
+
+    def atlas(self, mesh: Mesh) -> Atlas:
+        """The texture of the finished mesh."""
+        most = int(self._config.atlas_megatexels * 1e6)
+        return build_atlas(mesh, self.texels, self._map.config.voxel_m, most)
 
     @property
     def lost(self) -> Mapping[str, int]:
