@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from artemis_edge.commands import models, rig, session
+from artemis_edge.commands import models, output, rig, session, texture
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -96,8 +96,8 @@ def _parser() -> argparse.ArgumentParser:
         _reprocess,
         _evaluate,
         _bench,
-        _render,
-        _export,
+        output.add_render,
+        output.add_export,
         _check,
         session.add,
         models.add,
@@ -194,6 +194,7 @@ def _evaluate(commands: Any) -> None:
     mesh.add_argument("--crop", action="store_true", help="leave out the mesh outside the reference's box")
     mesh.add_argument("--heatmap", type=Path, metavar="FILE.png", help="precision and recall from above")
     _json_option(mesh)
+    texture.add(kinds)
     path = _command(kinds, "trajectory", run_evaluate_trajectory, "a trajectory against a reference")
     path.add_argument("estimate", type=Path, metavar="ESTIMATE.tum")
     path.add_argument("--reference", type=Path, required=True, metavar="REF.tum")
@@ -208,23 +209,6 @@ def _bench(commands: Any) -> None:
     )
     _config_options(parser)
     _json_option(parser)
-
-
-def _render(commands: Any) -> None:
-    parser = _command(commands, "render", run_render, "picture of a map as a camera would take it")
-    parser.add_argument("map", type=Path, metavar="MAP", help="an output directory or a mesh.ply")
-    parser.add_argument("--pose", required=True, metavar='"tx ty tz qx qy qz qw"', help="T_world_cam")
-    parser.add_argument("--intrinsics", required=True, metavar='"w h fx fy cx cy"')
-    parser.add_argument("--distortion", metavar='"k1 k2 p1 p2 k3"')
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
-    parser.add_argument("--depth", type=Path, metavar="FILE.npy", help="metres along z, NaN where nothing")
-
-
-def _export(commands: Any) -> None:
-    parser = _command(commands, "export", run_export, "write a map in another format")
-    parser.add_argument("map", type=Path, metavar="MAP", help="an output directory or a mesh.ply")
-    parser.add_argument("--format", choices=("ply", "glb"), required=True)
-    parser.add_argument("--out", type=Path, required=True, metavar="PATH")
 
 
 def _check(commands: Any) -> None:
@@ -350,26 +334,6 @@ def run_bench(given: argparse.Namespace) -> int:
         _print_json(result)
     else:
         print(bench.to_text(result))
-    return DONE
-
-
-def run_render(given: argparse.Namespace) -> int:
-    """``artemis-edge render``."""
-    from artemis_edge import render
-
-    render.run(given.map, given.pose, given.intrinsics, given.distortion, given.out, given.depth)
-    return DONE
-
-
-def run_export(given: argparse.Namespace) -> int:
-    """``artemis-edge export``."""
-    from artemis_edge.export.glb import write_glb
-    from artemis_edge.export.ply import find_mesh, read_mesh, write_ply
-
-    if given.out.is_dir():
-        raise InputError(f"{given.out} is a folder; --out needs the name of a file")
-    write = {"ply": write_ply, "glb": write_glb}[given.format]
-    write(given.out, read_mesh(find_mesh(given.map)))
     return DONE
 
 

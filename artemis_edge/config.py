@@ -273,6 +273,23 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 150
 
 
+class KeepConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """What of the input stays in ``map/`` for exports and for ``evaluate texture`` (keeper.py)."""
+
+    points: Annotated[
+        int,
+        Meta(
+            description="Points at most, 22 bytes each; beyond it every second one goes.",
+            ge=0,
+            le=100_000_000,
+        ),
+    ] = 6_000_000
+    images: Annotated[
+        int,
+        Meta(description="Images at most; beyond it every second one goes.", ge=0, le=100_000),
+    ] = 300
+
+
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole configuration: one section a stage."""
 
@@ -281,6 +298,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     mesher: MesherConfig = MesherConfig()
     refinement: RefinementConfig = RefinementConfig()
+    keep: KeepConfig = KeepConfig()
 
 
 def load(file: Path | None = None, profile: str | None = None, sets: Iterable[str] = ()) -> Config:

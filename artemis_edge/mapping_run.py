@@ -17,7 +17,7 @@ import numpy as np
 from artemis_edge import health
 from artemis_edge.errors import InputError, RunError, UserError
 from artemis_edge.export.ply import Mesh
-from artemis_edge.frames import F64, FrameSource, MeshDelta, SyncedFrame, Trajectory
+from artemis_edge.frames import F64, FrameSource, MeshDelta, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.progress import Report, say
 from artemis_edge.session.results import disk_sentence
 from artemis_edge.session.statistics import RunStatistics
@@ -32,6 +32,7 @@ class Mapper(Protocol):
 
     stage_ms: dict[str, float]
     trajectory: list[tuple[int, F64]]
+    tracked: TrackedFrame | None
 
     @property
     def lost(self) -> Mapping[str, int]:

@@ -12,7 +12,7 @@ from artemis_edge.config import Config
 from artemis_edge.delta import Outbox
 from artemis_edge.export.atlas import write_atlas
 from artemis_edge.export.mesh import Mesh
-from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame
+from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
 from artemis_edge.map_writer import save_map, write_mesh
 from artemis_edge.mesher import Mesher
 from artemis_edge.paging import TIGHT, Pager
@@ -41,6 +41,7 @@ class Pipeline:
             page_folder,
         )
         self.outbox = Outbox(self.voxel_map.store)
+        self.tracked: TrackedFrame | None = None
         self.trajectory: list[tuple[int, F64]] = []
         self.stage_ms: dict[str, float] = {}
         self._stamp = 0
@@ -51,7 +52,7 @@ class Pipeline:
         self._stamp += 1
         self.stage_ms = {}
         with self._stage("odometry"):
-            tracked = self.odometry.track(frame)
+            tracked = self.tracked = self.odometry.track(frame)
         with self._stage("voxel_map"):
             active = self.voxel_map.insert(tracked, self._stamp)
             self.pager.bring_back(self.voxel_map.touched_blocks(), self._stamp)

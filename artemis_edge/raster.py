@@ -164,6 +164,23 @@ def _volume(b: F32, c: F32, x: float, y: float) -> float:
 
 
 @njit
+def corner_weights(
+    a: F32, b: F32, c: F32, x: float, y: float, orthographic: bool
+) -> tuple[float, float, float]:
+    """Barycentric weights of where the sight line (x, y) meets the triangle of three points in view coordinates.
+
+    A line that just misses the triangle takes its border.
+    """
+    wa, wb, wc = _weights(a, b, c, x, y, orthographic)
+    sign = 1.0 if wa + wb + wc > 0.0 else -1.0
+    wa, wb, wc = max(wa * sign, 0.0), max(wb * sign, 0.0), max(wc * sign, 0.0)
+    total = wa + wb + wc
+    if total > 0.0:
+        return wa / total, wb / total, wc / total
+    return 1.0, 0.0, 0.0  # seen exactly edge-on
+
+
+@njit
 def interpolate(
     points: F32,
     faces: I32,
@@ -187,16 +204,8 @@ def interpolate(
             if t < 0:
                 continue
             i, j, m = faces[t, 0], faces[t, 1], faces[t, 2]
-            wa, wb, wc = _weights(
-                points[i], points[j], points[m], lines[v, u, 0], lines[v, u, 1], orthographic
-            )
-            sign = 1.0 if wa + wb + wc > 0.0 else -1.0
-            wa, wb, wc = max(wa * sign, 0.0), max(wb * sign, 0.0), max(wc * sign, 0.0)
-            total = wa + wb + wc
-            if total > 0.0:
-                wa, wb, wc = wa / total, wb / total, wc / total
-            else:  # seen exactly edge-on
-                wa, wb, wc = 1.0, 0.0, 0.0
+            x, y = lines[v, u, 0], lines[v, u, 1]
+            wa, wb, wc = corner_weights(points[i], points[j], points[m], x, y, orthographic)
             depth[v, u] = wa * points[i, 2] + wb * points[j, 2] + wc * points[m, 2]
             for k in range(values.shape[1]):
                 out[v, u, k] = wa * values[i, k] + wb * values[j, k] + wc * values[m, k]

@@ -11,11 +11,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from artemis_edge.atlas_raster import find_texels, sample_page
 from artemis_edge.errors import InputError
+from artemis_edge.export.atlas import Atlas
 from artemis_edge.export.atomic import replacing, write_bytes
-from artemis_edge.export.ply import Mesh, find_mesh, read_mesh
+from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraModel
+from artemis_edge.highlighted import highlighted_triangles
 from artemis_edge.lens import undistorted_lines
+from artemis_edge.opened_map import open_map
 from artemis_edge.raster import NOTHING, Projection, draw, interpolate, project
 from artemis_edge.trajectory import inverse, matrix_from_quaternion
 
@@ -23,6 +27,8 @@ NEAR_M = 0.05
 # The canvas behind a lens is finer than the picture, so that borders fall within half a pixel of their place.
 _LENS_OVERSAMPLING = 2.0
 _LARGEST_CANVAS = 1 << 25
+# What is highlighted keeps some of its own colour, so that it can be recognised.
+_TINT, _TINT_SHARE = np.array([255.0, 64.0, 0.0], np.float32), np.float32(0.6)
 _NO_VALUES = np.empty((0, 0), np.float32)
 
 
@@ -77,7 +83,8 @@ def render(view: View, vertices: F32, faces: I32, values: F32 = _NO_VALUES) -> R
     points, triangle, nearness = _visible(view, vertices, faces)
     if values.shape[1] == 0:
         return Rendering(_depth(view, nearness), triangle, np.zeros((*triangle.shape, 0), np.float32))
-    return _interpolated(points, faces, triangle, _sight_lines(view), view.projection.orthographic, values)
+    sight = _Sight(points, triangle, _sight_lines(view), view.projection.orthographic)
+    return _interpolated(sight, faces, values)
 
 
 def depth_map(view: View, vertices: F32, faces: I32) -> F32:
@@ -93,8 +100,24 @@ def render_camera(
     What is seen at a pixel is decided on a finer pinhole canvas; where its line of sight meets that triangle
     is computed exactly. Pixels that no line of sight of the lens model reaches show nothing.
     """
+    return _interpolated(_look(camera, T_world_cam, vertices, faces), faces, values)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sight:
+    """What each pixel shows: ``points`` (n, 3) in view coordinates, ``triangle`` and sight ``lines`` per pixel."""
+
+    points: F32
+    triangle: I32
+    lines: F32
+    orthographic: bool = False
+
+
+def _look(camera: CameraModel, T_world_cam: F64, vertices: F32, faces: I32) -> _Sight:
     if not any(camera.distortion):
-        return render(perspective(camera, T_world_cam), vertices, faces, values)
+        view = perspective(camera, T_world_cam)
+        points, triangle, _ = _visible(view, vertices, faces)
+        return _Sight(points, triangle, _sight_lines(view))
     lines = undistorted_lines(camera)
     canvas = _canvas_behind(camera, lines, T_world_cam)
     points, triangle, _ = _visible(canvas, vertices, faces)
@@ -103,8 +126,7 @@ def render_camera(
     x, y = np.nan_to_num(lines[..., 0]), np.nan_to_num(lines[..., 1])
     u = np.rint(p.fx * x + p.cx).astype(np.int64).clip(0, canvas.width - 1)
     v = np.rint(p.fy * y + p.cy).astype(np.int64).clip(0, canvas.height - 1)
-    seen = np.where(reached, triangle[v, u], np.int32(NOTHING))
-    return _interpolated(points, faces, seen, lines, False, values)
+    return _Sight(points, np.where(reached, triangle[v, u], np.int32(NOTHING)), lines)
 
 
 def _visible(view: View, vertices: F32, faces: I32) -> tuple[F32, I32, F32]:
@@ -131,14 +153,13 @@ def _sight_lines(view: View) -> F32:
     return lines
 
 
-def _interpolated(
-    points: F32, faces: I32, triangle: I32, lines: F32, orthographic: bool, values: F32
-) -> Rendering:
-    depth = np.full(triangle.shape, np.nan, np.float32)
-    out = np.zeros((*triangle.shape, values.shape[1]), np.float32)
+def _interpolated(sight: _Sight, faces: I32, values: F32) -> Rendering:
+    shape = sight.triangle.shape
+    depth = np.full(shape, np.nan, np.float32)
+    out = np.zeros((*shape, values.shape[1]), np.float32)
     values = np.ascontiguousarray(values, np.float32)
-    interpolate(points, faces, triangle, lines, orthographic, values, out, depth)
-    return Rendering(depth, triangle, out)
+    interpolate(sight.points, faces, sight.triangle, sight.lines, sight.orthographic, values, out, depth)
+    return Rendering(depth, sight.triangle, out)
 
 
 def _canvas_behind(camera: CameraModel, lines: F32, T_world_cam: F64) -> View:
@@ -154,21 +175,63 @@ def _canvas_behind(camera: CameraModel, lines: F32, T_world_cam: F64) -> View:
     return View(width, height, projection, inverse(T_world_cam))
 
 
-def overlay(mesh: Mesh, camera: CameraModel, T_world_cam: F64) -> tuple[U8, F32]:
-    """RGBA uint8 (h, w, 4) of the mesh's colours, alpha 0 where nothing, and depth float32 (h, w)."""
-    seen = render_camera(camera, T_world_cam, mesh.vertices, mesh.faces, mesh.colours.astype(np.float32))
+def render_coloured(mesh: Mesh, atlas: Atlas | None, camera: CameraModel, T_world_cam: F64) -> Rendering:
+    """As :func:`render_camera`, with ``values`` (h, w, 3) 0..255 from the atlas where a triangle is textured, else
+    from the vertices.
+    """
+    sight = _look(camera, T_world_cam, mesh.vertices, mesh.faces)
+    seen = _interpolated(sight, mesh.faces, mesh.colours.astype(np.float32))
+    if atlas is not None:
+        _paint(sight, mesh.faces, atlas, seen.values)
+    return seen
+
+
+def _paint(sight: _Sight, faces: I32, atlas: Atlas, out: F32) -> None:
+    shape = sight.triangle.shape
+    page, uv = np.empty(shape, np.int32), np.zeros((*shape, 2), np.float32)
+    find_texels(
+        sight.points, faces, sight.triangle, sight.lines, sight.orthographic, atlas.page, atlas.uv, page, uv
+    )
+    for number in np.unique(page[page >= 0]).tolist():
+        sample_page(atlas.pages[number], number, page, uv, out)
+
+
+def overlay(
+    mesh: Mesh,
+    camera: CameraModel,
+    T_world_cam: F64,
+    atlas: Atlas | None = None,
+    highlighted: Bool | None = None,
+) -> tuple[U8, F32]:
+    """RGBA uint8 (h, w, 4) of the map's colours, alpha 0 where nothing, and depth float32 (h, w).
+
+    ``highlighted`` bool (m,) names triangles to tint.
+    """
+    seen = render_coloured(mesh, atlas, camera, T_world_cam)
+    colours = seen.values
+    if highlighted is not None:
+        tinted = seen.covered & highlighted[np.maximum(seen.triangle, 0)]
+        colours[tinted] += _TINT_SHARE * (_TINT - colours[tinted])
     rgba = np.zeros((camera.height, camera.width, 4), np.uint8)
-    rgba[..., :3] = np.rint(seen.values).clip(0, 255)
+    rgba[..., :3] = np.rint(colours).clip(0, 255)
     rgba[..., 3] = np.where(seen.covered, 255, 0)
     return rgba, seen.depth
 
 
 def run(
-    map_path: Path, pose: str, intrinsics: str, distortion: str | None, out: Path, depth: Path | None = None
+    map_path: Path,
+    pose: str,
+    intrinsics: str,
+    distortion: str | None,
+    out: Path,
+    depth: Path | None = None,
+    highlight: str | None = None,
 ) -> None:
     """The command ``render``: texts as given there, PNG to ``out``, depth as .npy to ``depth``."""
     camera, T_world_cam = parse_camera(intrinsics, distortion), parse_pose(pose)
-    rgba, z = overlay(read_mesh(find_mesh(map_path)), camera, T_world_cam)
+    mesh, atlas = open_map(map_path)
+    chosen = None if highlight is None else highlighted_triangles(map_path, mesh, highlight)
+    rgba, z = overlay(mesh, camera, T_world_cam, atlas, chosen)
     write_png(out, rgba)
     if depth is not None:
         with replacing(depth) as file:

@@ -16,9 +16,11 @@ from artemis_edge.compile_ahead import compile_ahead
 from artemis_edge.config import Config, to_toml
 from artemis_edge.datasets import lidar_poses, open_input
 from artemis_edge.errors import InputError, RunError
+from artemis_edge.export.atlas import read_atlas
 from artemis_edge.export.glb import write_glb
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import FrameSource, Odometry, SyncedFrame, Trajectory
+from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, readable, warm_up
 from artemis_edge.odometry.given_poses import GivenPoses
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
@@ -96,13 +98,14 @@ def reprocess(
             mapper = make(request.config, tracker, pages)
             run = MappingRun(mapper, source, span, statistics)
             photos = HeldOut(request.out, request.holdout)
-            run.frames(report, interrupt, photos.take)
+            keeper = Keeper(pages, request.config.keep)
+            run.frames(report, interrupt, keeper.between(photos.take, mapper))
             if not statistics.frame_ms:
                 raise _nothing_mapped(run, source, span)
             run.flush()
         count_losses(statistics, source, tracker, mapper)
         results = Results(request.out)
-        outcome = _write(results, run, mapper, photos, statistics, evaluate)
+        outcome = _write(results, run, mapper, keeper, photos, statistics, evaluate)
     _complain(run, results, request.out)
     if outcome is not None and not outcome["triangles"]:
         raise _nothing_meshed(outcome, request, results)
@@ -189,6 +192,7 @@ def _write(
     results: Results,
     run: MappingRun,
     mapper: Mapper,
+    keeper: Keeper,
     photos: HeldOut,
     statistics: RunStatistics,
     evaluate: Evaluate | None,
@@ -203,11 +207,13 @@ def _write(
         lost = results.attempt(INDEX, lambda path: photos.write_index(path, trajectory))
         statistics.add_lost({"photos_without_pose": lost} if lost else {})
     mesh = results.attempt("mesh.ply", mapper.write_mesh)
-    statistics.map_bytes = results.directory("map", mapper.save) or 0
+    saved = results.directory("map", lambda folder: (mapper.save(folder), keeper.save(folder, trajectory)))
+    statistics.map_bytes, statistics.kept_bytes = saved or (0, 0)
     if mesh is None:
         return None
     whole = mesh
-    results.attempt("mesh.glb", lambda path: write_glb(path, whole))
+    atlas = read_atlas(results.folder / "map") if saved else None
+    results.attempt("mesh.glb", lambda path: write_glb(path, whole, atlas))
     statistics.peak_rss_mb = health.peak_resident_mb() or None
     evaluation = evaluate(whole, trajectory) if evaluate is not None and len(whole.faces) else None
     return results.attempt(

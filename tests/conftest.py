@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from artemis_edge.export.ply import Mesh, bare_mesh, write_ply
-from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame
+from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
 
 
 class FakeMapper:
@@ -19,13 +19,14 @@ class FakeMapper:
         self.odometry = odometry
         self.stage_ms: dict[str, float] = {}
         self.trajectory: list[tuple[int, F64]] = []
+        self.tracked: TrackedFrame | None = None
         self.lost: dict[str, int] = {}
         self.finished = False
         self.before_frame: Callable[[int], None] = lambda index: None
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
         self.before_frame(frame.index)
-        tracked = self.odometry.track(frame)
+        tracked = self.tracked = self.odometry.track(frame)
         self.trajectory.append((tracked.stamp_ns, tracked.T_world_lidar))
         self.stage_ms = {"odometry": 1.0, "mesher": 2.0}
         empty, ids, triples = np.empty((0, 3)), np.zeros(1, np.int64), np.empty((0, 3), np.int64)

@@ -262,8 +262,8 @@ def test_glb_of_nothing_and_of_nan(tmp_path: Path) -> None:
         write_glb(tmp_path / "n.glb", mesh)
 
 
-def test_glb_normal_of_a_loose_vertex_is_unit(tmp_path: Path) -> None:
-    loose = bare_mesh(np.eye(4, 3), np.array([[0, 1, 2]], np.int32))
+def test_glb_normal_of_a_vertex_without_one_is_unit(tmp_path: Path) -> None:
+    loose = bare_mesh(np.eye(4, 3), np.array([[0, 1, 2], [3, 3, 3]], np.int32))
     assert (loose.normals[3] == 0).all()
     write_glb(tmp_path / "l.glb", loose)
     document, binary = read_chunks(tmp_path / "l.glb")

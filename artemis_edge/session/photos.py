@@ -53,8 +53,7 @@ class HeldOut:
         self._seen[image.name] = number
         if number % self.every:
             return False
-        suffix = "png" if image.encoded.startswith(_PNG_MAGIC) else "jpg"
-        file = f"{FOLDER}/{image.name}_{number:06d}.{suffix}"
+        file = f"{FOLDER}/{image.name}_{number:06d}.{suffix_of(image.encoded)}"
         (self.out / FOLDER).mkdir(exist_ok=True)
         write_bytes(self.out / file, image.encoded)
         self._photos.append(_Photo(file, replace(image, encoded=b"")))
@@ -84,16 +83,24 @@ class HeldOut:
         stamps = np.array([photo.image.stamp_ns for photo in self._photos], np.int64)
         known = covered(trajectory, stamps)
         poses = interpolate(trajectory, stamps) if known.any() else np.empty((0, 4, 4))
-        content = [_entry(self._photos[k], poses[k]) for k in np.flatnonzero(known)]
+        content = [
+            photo_entry(self._photos[k].file, self._photos[k].image, poses[k]) for k in np.flatnonzero(known)
+        ]
         write_bytes(path, (json.dumps({"photos": content}, indent=1) + "\n").encode())
         return int(np.count_nonzero(~known))
 
 
-def _entry(photo: _Photo, T_world_lidar: F64) -> dict[str, Any]:
-    model = photo.image.model
-    T_cam_world: Sequence[Any] = (photo.image.T_cam_lidar @ inverse(T_world_lidar)).tolist()
+def suffix_of(encoded: bytes) -> str:
+    """``png`` or ``jpg``, for the name of an encoded image's file."""
+    return "png" if encoded.startswith(_PNG_MAGIC) else "jpg"
+
+
+def photo_entry(file: str, image: CameraImage, T_world_lidar: F64) -> dict[str, Any]:
+    """Entry of PHOTOS.json for an image whose ``T_world_lidar`` at its stamp is known."""
+    model = image.model
+    T_cam_world: Sequence[Any] = (image.T_cam_lidar @ inverse(T_world_lidar)).tolist()
     return {
-        "file": photo.file,
+        "file": file,
         "fx": model.fx,
         "fy": model.fy,
         "cx": model.cx,

@@ -41,6 +41,7 @@ class RunStatistics:
     lost: dict[str, int] = field(default_factory=dict)
     peak_rss_mb: float | None = None
     map_bytes: int = 0
+    kept_bytes: int = 0
     config_toml: str = ""
 
     def add_frame(self, frame_ms: float, cpu_ms: float, stage_ms: Mapping[str, float]) -> None:
@@ -72,6 +73,7 @@ class RunStatistics:
             "warmup_s": round(self.warmup_s, _DIGITS),
             "peak_rss_mb": round(peak, 1),
             "map_bytes": self.map_bytes,
+            "kept_bytes": self.kept_bytes,
             "realtime_factor": self._realtime_factor(),
             "input_hz": round(self.input_hz, _DIGITS),
             "versions": versions(),

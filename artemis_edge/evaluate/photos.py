@@ -1,0 +1,102 @@
+"""PHOTOS.json and the photographs it names."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from artemis_edge.errors import InputError
+from artemis_edge.frames import F64, U8, CameraModel
+from artemis_edge.trajectory import inverse
+
+# A rotation printed with a few digits is orthonormal up to this.
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Photo:
+    """A photograph: ``image`` uint8 (h, w, 3) RGB, its camera, and ``T_world_cam`` (4, 4)."""
+
+    file: str
+    image: U8
+    camera: CameraModel
+    T_world_cam: F64
+
+
+def read_photos(path: Path) -> Iterator[Photo]:
+    """The photographs of PHOTOS.json one by one; file names are relative to its folder.
+
+    Raises InputError for an index or a photograph that cannot be used.
+    """
+    for number, entry in enumerate(_entries(path)):
+        yield _photo(path.parent, entry, f"photo {number} of {path}")
+
+
+def count_photos(path: Path) -> int:
+    """How many photographs the index names, of which there must be some; InputError as above."""
+    return len(_entries(path))
+
+
+def _entries(path: Path) -> list[Any]:
+    try:
+        content = json.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except ValueError:
+        raise InputError(f"{path} is not JSON; `reprocess --holdout N` writes PHOTOS.json") from None
+    entries = content.get("photos") if isinstance(content, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{path} names no photos; `reprocess --holdout N` writes PHOTOS.json")
+    return entries
+
+
+def _photo(folder: Path, entry: Any, where: str) -> Photo:
+    try:
+        file = str(entry["file"])
+        fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
+        k1, k2, p1, p2, k3 = (float(k) for k in entry["distortion"])
+        T_cam_world = np.array(entry["T_cam_world"], np.float64)
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            f"{where} is not complete; it needs file, fx, fy, cx, cy, distortion and T_cam_world"
+        ) from None
+    numbers = np.array([fx, fy, cx, cy, k1, k2, p1, p2, k3])
+    if not np.isfinite(numbers).all() or fx <= 0.0 or fy <= 0.0:
+        raise InputError(f"{where}: the camera's numbers must be finite, fx and fy positive")
+    if not _is_pose(T_cam_world):
+        raise InputError(f"{where}: T_cam_world is not a rotation and a translation as a 4 x 4 matrix")
+    image = read_image(folder / file)
+    height, width = image.shape[:2]
+    camera = CameraModel(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    return Photo(file, image, camera, inverse(T_cam_world))
+
+
+def _is_pose(T: F64) -> bool:
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(R) > 0.0)
+
+
+def read_image(path: Path) -> U8:
+    """A picture file as RGB uint8 (h, w, 3); InputError if it cannot be read."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read the photograph {path}: {error.strerror}") from None
+    return decoded(content, str(path))
+
+
+def decoded(content: bytes, name: str) -> U8:
+    """An encoded picture as RGB uint8 (h, w, 3); InputError naming it if it is none."""
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    if image is None:
+        raise InputError(f"{name} is not a picture that can be decoded; take it out or copy it again")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

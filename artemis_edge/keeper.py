@@ -1,0 +1,84 @@
+"""What of the input stays beside the map: its points and images, for the baseline of ``evaluate texture`` and exports.
+
+Everything is written between frames, never inside one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from artemis_edge.colouring import colour_points
+from artemis_edge.config import KeepConfig
+from artemis_edge.frames import F32, F64, LidarScan, SyncedFrame, TrackedFrame, Trajectory
+from artemis_edge.kept_images import ImageSpool
+from artemis_edge.kept_points import PointSpool
+from artemis_edge.progress import Report, silent
+
+Prepare = Callable[[SyncedFrame], SyncedFrame]
+
+
+class Tracker(Protocol):
+    """What the keeper needs of the pipeline: the last frame that was tracked."""
+
+    tracked: TrackedFrame | None
+
+
+class Keeper:
+    """Keeps what the frames of a run brought, in ``folder`` until it is saved."""
+
+    def __init__(self, folder: Path, rules: KeepConfig) -> None:
+        self._points = PointSpool(folder / "points", rules.points)
+        images = folder / "images"
+        images.mkdir()
+        self._images = ImageSpool(images, rules.images)
+        self._pending: tuple[SyncedFrame, Tracker] | None = None
+
+    def between(self, prepare: Prepare, tracker: Tracker) -> Prepare:
+        """``prepare``, which is called before every frame, after what the last frame brought is written."""
+
+        def both(frame: SyncedFrame) -> SyncedFrame:
+            self.store()
+            frame = prepare(frame)
+            self._pending = frame, tracker
+            return frame
+
+        return both
+
+    def store(self) -> None:
+        """Write what the last frame brought, if it could be tracked."""
+        if self._pending is None:
+            return
+        frame, tracked = self._pending[0], self._pending[1].tracked
+        self._pending = None
+        if tracked is None or tracked.index != frame.index:
+            return
+        for image in frame.images:
+            self._images.add(image)
+        for scan, moved in zip(frame.scans, tracked.scans, strict=True):
+            time_s, intensity = _of_rows(scan, len(moved.points))
+            points = _to_world(moved.points, tracked.T_world_lidar)
+            self._points.add(points, scan.stamp_ns, time_s, intensity)
+
+    def save(self, folder: Path, trajectory: Trajectory, report: Report = silent) -> int:
+        """Write points and images into a map's folder and colour the points; returns the size in bytes."""
+        self.store()
+        size = self._points.save(folder) + self._images.save(folder, trajectory)
+        colour_points(folder, report)
+        return size
+
+
+def _to_world(points: F32, T_world_lidar: F64) -> F32:
+    R, t = T_world_lidar[:3, :3], T_world_lidar[:3, 3]
+    world: F32 = (points @ R.T + t).astype(np.float32)
+    return world
+
+
+def _of_rows(scan: LidarScan, count: int) -> tuple[F32, F32 | None]:
+    """Time and intensity of the points; zero and unknown where an odometry leaves points out."""
+    same = count == len(scan.points)
+    zero = np.zeros(count, np.float32)
+    return scan.offset_s if same and scan.offset_s is not None else zero, scan.intensity if same else None

@@ -1,0 +1,67 @@
+"""``map/images/`` and ``map/images.json``: photographs of the run, in bounded number, with their poses.
+
+The index has the form of PHOTOS.json. Exporters and the colouring of points use them.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from artemis_edge.export.atomic import write_bytes
+from artemis_edge.frames import CameraImage, Trajectory
+from artemis_edge.session.photos import photo_entry, suffix_of
+from artemis_edge.trajectory import covered, interpolate
+
+FOLDER = "images"
+INDEX = "images.json"
+
+
+class ImageSpool:
+    """Takes images as they come; beyond ``most`` every second one of each camera goes, later ones come sparser."""
+
+    def __init__(self, folder: Path, most: int) -> None:
+        self._folder, self._most = folder, most
+        self._stride = 1
+        self._offered: dict[str, int] = {}
+        self._kept: list[tuple[int, str, CameraImage]] = []  # number within its camera, file name, image
+
+    def add(self, image: CameraImage) -> None:
+        """Write the image, or leave it out."""
+        number = self._offered.get(image.name, 0)
+        self._offered[image.name] = number + 1
+        if self._most == 0 or number % self._stride:
+            return
+        name = f"{image.name}_{number:06d}.{suffix_of(image.encoded)}"
+        (self._folder / name).write_bytes(image.encoded)
+        self._kept.append((number, name, replace(image, encoded=b"")))
+        while len(self._kept) > max(self._most, len(self._offered)):
+            self._stride *= 2
+            for old, file, _ in self._kept:
+                if old % self._stride:
+                    (self._folder / file).unlink()
+            self._kept = [row for row in self._kept if row[0] % self._stride == 0]
+
+    def save(self, folder: Path, trajectory: Trajectory) -> int:
+        """Move the images with a pose into a map's folder and write their index; returns the size in bytes.
+
+        The pose of an image is interpolated at the middle of its exposure.
+        """
+        stamps = np.array([image.stamp_ns for _, _, image in self._kept], np.int64)
+        known = np.flatnonzero(covered(trajectory, stamps))
+        if len(known) == 0:
+            return 0
+        (folder / FOLDER).mkdir()
+        poses, entries, size = interpolate(trajectory, stamps), [], 0
+        for k in known.tolist():
+            _, name, image = self._kept[k]
+            target = folder / FOLDER / name
+            (self._folder / name).replace(target)
+            size += target.stat().st_size
+            entries.append(photo_entry(f"{FOLDER}/{name}", image, poses[k]) | {"stamp_ns": image.stamp_ns})
+        content = (json.dumps({"photos": entries}, indent=1) + "\n").encode()
+        write_bytes(folder / INDEX, content)
+        return size + len(content)
