@@ -290,6 +290,38 @@ class KeepConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 300
 
 
+class SegmentationConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """Segmentation of images by words (section III-B, segmentation/; docs/models.md)."""
+
+    model: Annotated[
+        str,
+        Meta(description="Registered model; empty: the user's only one, else the one that ships."),
+    ] = ""
+    least_score: Annotated[
+        float, _float("Instances of less probability are not found.", ge=0.01, le=0.99)
+    ] = 0.25
+    overlap: Annotated[
+        float, _float("Boxes that share more than this (IoU) are one object.", ge=0.05, le=0.99)
+    ] = 0.7
+    most_hz: Annotated[
+        float,
+        _float("Images a second of one camera that are segmented live; 0: all [Hz].", ge=0.0, le=1000.0),
+    ] = 0.0
+    every: Annotated[
+        int, Meta(description="In reprocess, images of every so many frames are segmented.", ge=1, le=1000)
+    ] = 2
+    delay_frames: Annotated[
+        int, Meta(description="In reprocess, frames after which a mask is fused.", ge=1, le=1000)
+    ] = 3
+    keyframe_m: Annotated[
+        float, _float("Photographs kept for later questions are so far apart [m].", ge=0.01, le=1000.0)
+    ] = 0.5
+    keyframe_deg: Annotated[float, _float("Or turned by so much [degrees].", ge=0.1, le=180.0)] = 15.0
+    keyframes_mb: Annotated[
+        int, Meta(description="What they may take on disk; 0: none is kept [MB].", ge=0, le=1_000_000)
+    ] = 200
+
+
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole configuration: one section a stage."""
 
@@ -299,6 +331,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     mesher: MesherConfig = MesherConfig()
     refinement: RefinementConfig = RefinementConfig()
     keep: KeepConfig = KeepConfig()
+    segmentation: SegmentationConfig = SegmentationConfig()
 
 
 def load(file: Path | None = None, profile: str | None = None, sets: Iterable[str] = ()) -> Config:

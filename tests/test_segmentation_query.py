@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, U8
+from artemis_edge.segmentation.attribute import AttributeBackend, shape_scores
 from artemis_edge.segmentation.backend import Prompt, Segmentation, Status, Support
 from artemis_edge.segmentation.colours import colour_fit
 from artemis_edge.segmentation.layout import Box, between, gap, gap_above, seen_from
@@ -343,6 +344,27 @@ def test_gap_counts_height_and_degenerate_boxes() -> None:
     assert gap(point, point) == 0.0
     assert between(point, point, point) == 0.0
     assert seen_from(point.centre, "behind", low, point) == 0.0
+
+
+# --- without a network
+
+
+def test_pieces_of_the_mesh_are_judged_by_size() -> None:
+    backend = AttributeBackend()
+    asked = understand("red car", backend)
+    assert (asked.status, asked.classes[0]) == (Status.APPROXIMATE, "car")
+    assert "size and shape only" in asked.reason
+    assert understand("giraffe", backend).status is Status.UNSUPPORTED
+    assert understand("vehicles", backend).status is Status.APPROXIMATE
+    pieces = [Thing(item.id, shape_scores(item.box), item.box, item.colour) for item in scene()]
+    assert [hit.id for hit in select(asked, pieces).hits] == [1]
+    person = select(understand("person", backend), pieces)
+    assert {hit.id for hit in person.hits} == {4, 5}
+    assert person.status is Status.APPROXIMATE
+    assert shape_scores(Box(np.zeros(3), np.zeros(3))) == {}
+    found = backend.segment(np.zeros((4, 6, 3), np.uint8), [Prompt(1, "car"), Prompt(2, "giraffe")])
+    assert [answer.status for answer in found.answers] == [Status.NOT_FOUND, Status.UNSUPPORTED]
+    assert found.dense.sample(np.array([2.0]), np.array([1.0])).tolist() == [[1.0]]
 
 
 # --- colours

@@ -89,8 +89,6 @@ def run_list(given: argparse.Namespace) -> int:
     entries = Registry().entries()
     if given.json:
         print_json({"models": [_entry_json(entry) for entry in entries]})
-    elif not entries:
-        print("no model is registered; add one with 'artemis-edge models add FILE --sha256 H'")
     else:
         print("\n".join(_entry_text(entry) for entry in entries))
     return DONE
@@ -193,6 +191,8 @@ def _entry_text(entry: Entry) -> str:
     said = entry.manifest
     if entry.problem:
         return f"{said.name}: not usable: {entry.problem}"
+    if said.kind == "attribute":
+        return f"{said.name}: {said.note}"
     marks = ["ships with the program"] if entry.shipped else []
     marks += ["for virtual worlds only, of no use on photographs"] if said.synthetic_only else []
     count = f"{len(said.classes)} classes" if said.classes else "any words"

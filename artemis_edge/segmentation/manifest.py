@@ -11,8 +11,7 @@ from msgspec import Meta, Struct
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 
-Kind = Literal["yolo-seg", "fastsam-clip", "openvocab-seg", "semantic"]
-KINDS: tuple[Kind, ...] = ("yolo-seg", "fastsam-clip", "openvocab-seg", "semantic")
+Kind = Literal["yolo-seg", "fastsam-clip", "openvocab-seg", "semantic", "attribute"]
 
 Hash = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 #: A file name beside the manifest, not a path.

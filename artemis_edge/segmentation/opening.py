@@ -13,7 +13,8 @@ import numpy as np
 from artemis_edge.errors import InputError
 from artemis_edge.frames import U8
 from artemis_edge.segmentation import yolo
-from artemis_edge.segmentation.backend import MOST_SLOTS, Backend, Prompt
+from artemis_edge.segmentation.attribute import AttributeBackend
+from artemis_edge.segmentation.backend import MOST_SLOTS, Backend, Prompt, Status
 from artemis_edge.segmentation.clip import EmbeddingTable, ImageEncoder, TextEncoder, TextFeatures
 from artemis_edge.segmentation.clip_tokens import Tokenizer
 from artemis_edge.segmentation.fastsam_clip import FastSamClip
@@ -33,6 +34,7 @@ ROLES: Mapping[Kind, tuple[str, ...]] = {
     "semantic": (),
     "fastsam-clip": ("image", "text", "vocabulary", "embeddings"),
     "openvocab-seg": ("text", "vocabulary", "embeddings"),
+    "attribute": (),
 }
 
 
@@ -104,6 +106,8 @@ def names_in(network: Network) -> tuple[str, ...]:
 
 def open_model(manifest: Manifest, folder: Path, thresholds: Thresholds | None = None) -> Backend:
     """The backend of a model whose files are in ``folder``; raises InputError where something does not fit."""
+    if manifest.kind == "attribute":
+        return AttributeBackend()
     network = Network(folder / manifest.file)
     check_signature(network, manifest.kind, len(manifest.classes))
     limits = thresholds or Thresholds()
@@ -152,7 +156,9 @@ class Smoke:
 def smoke_test(backend: Backend) -> Smoke:
     """Two images of noise through a backend; raises InputError where it fails or gives no numbers."""
     words = [canonical(name) for name in backend.classes] or list(_SMOKE_WORDS)
-    asked = [word for word in dict.fromkeys(words) if backend.support(word).reason == ""][:MOST_SLOTS]
+    asked = [word for word in dict.fromkeys(words) if backend.support(word).status is Status.MATCHED][
+        :MOST_SLOTS
+    ]
     prompts = [Prompt(k + 1, word) for k, word in enumerate(asked)]
     ms = 0.0
     for seed in range(2):

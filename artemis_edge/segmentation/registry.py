@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from artemis_edge.errors import InputError, RunError, UserError
+from artemis_edge.segmentation import attribute
 from artemis_edge.segmentation.backend import Backend
 from artemis_edge.segmentation.manifest import Kind, Manifest, Part, read_manifest, write_manifest
 from artemis_edge.segmentation.network import Network
@@ -63,6 +64,8 @@ class Entry:
 
     def open(self, thresholds: Thresholds | None = None) -> Backend:
         """The model at work; raises InputError where its files are damaged."""
+        if self.manifest.kind == "attribute":
+            return open_model(self.manifest, self.folder)
         problem = self.problem or _damage(self.manifest, self.folder)
         if problem:
             raise InputError(problem)
@@ -84,6 +87,11 @@ def shipped_folder() -> Path:
     return Path(str(resources.files("artemis_edge.segmentation") / "shipped"))
 
 
+def open_by_name(name: str = "", thresholds: Thresholds | None = None) -> Backend:
+    """A model at work by its name; a function that a process of its own can be given."""
+    return Registry().find(name).open(thresholds)
+
+
 class Registry:
     """All models, by name. Names of shipped models cannot be taken."""
 
@@ -92,14 +100,15 @@ class Registry:
         self._shipped = shipped or shipped_folder()
 
     def entries(self) -> list[Entry]:
-        """Every model: the user's by name, then the shipped ones. Damaged ones are there with their problem."""
+        """Every model: the user's by name, those that ship, last the one without a network; with their problems."""
         own = sorted(self.store.glob(f"*/{_MANIFEST}"), key=str) if self.store.is_dir() else []
         ours = sorted(self._shipped.glob("*.json"), key=str)
         found = [_entry(path, False) for path in own if not path.parent.name.startswith(".")]
-        return found + [_entry(path, True) for path in ours]
+        found += [_entry(path, True) for path in ours]
+        return [*found, Entry(attribute.manifest(), self._shipped, True)]
 
     def find(self, name: str = "") -> Entry:
-        """The model of that name; without a name the user's only one, else the shipped one."""
+        """The model of that name; without a name the user's only one, else the one that ships, else ``attribute``."""
         entries = self.entries()
         if name:
             for entry in entries:
@@ -111,8 +120,6 @@ class Registry:
         if len(own) > 1:
             names = ", ".join(entry.manifest.name for entry in own)
             raise InputError(f"several models are registered ({names}); choose one with --model NAME")
-        if not entries:
-            raise InputError("no model is registered; add one with 'artemis-edge models add FILE --sha256 H'")
         return entries[0]
 
     def add(self, wanted: Addition) -> tuple[Manifest, Smoke]:

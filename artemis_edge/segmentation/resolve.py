@@ -45,7 +45,8 @@ def resolve(noun: str, backend: Backend) -> Resolved:
     if direct.status is not Status.UNSUPPORTED:
         return Resolved(noun, (noun, *below), direct.status, direct.reason)
     if below:
-        return Resolved(noun, below, Status.MATCHED)
+        first = backend.support(below[0])
+        return Resolved(noun, below, first.status, first.reason)
     for above in words.broader(noun):
         if above in own:
             reason = f"the model {backend.name} knows '{above}' only, not '{noun}' among them"

@@ -1,0 +1,217 @@
+"""Photographs kept with a map, so that a later question is answered without walking back.
+
+``map/keyframes/`` holds them still encoded, with an ``index.json`` of the form of PHOTOS.json. What is kept is what
+was seen from elsewhere or towards elsewhere; where they grow beyond their budget, from farther apart.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from artemis_edge.errors import InputError
+from artemis_edge.export.atomic import write_bytes
+from artemis_edge.frames import F64, U8, CameraImage, CameraModel
+from artemis_edge.progress import Report, silent
+from artemis_edge.segmentation.backend import Backend, Prompt, Segmentation
+from artemis_edge.segmentation.trial import decode
+from artemis_edge.trajectory import inverse
+
+FOLDER = "keyframes"
+INDEX = "index.json"
+#: What other parts of the program may have kept of a map's photographs, in the same form.
+_OTHER_INDEX = "images.json"
+_THINNING = 1.4  # the distance grows by this factor, the number falls to about half
+_DISTORTION = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """Two views of a camera differ when they are so far apart or turned by so much (the one makes up for the other)."""
+
+    metres: float
+    radians: float
+
+    def scaled(self, factor: float) -> Apart:
+        """Farther apart."""
+        return Apart(self.metres * factor, self.radians * factor)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    image: CameraImage  # without its bytes
+    T_world_cam: F64
+    file: str
+    size: int
+
+
+@dataclass(slots=True)
+class KeyframeStore:
+    """Takes photographs as they come and keeps those from new views, at most ``budget_bytes`` of them.
+
+    They are written to ``folder`` at once, so that they need no memory.
+    """
+
+    folder: Path
+    apart: Apart
+    budget_bytes: int
+    offered: int = 0
+    _kept: list[_Kept] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @property
+    def size(self) -> int:
+        """Bytes on disk."""
+        return sum(kept.size for kept in self._kept)
+
+    def offer(self, image: CameraImage, T_world_cam: F64) -> bool:
+        """Keep a photograph if it shows what none kept shows; says whether it was kept."""
+        self.offered += 1
+        if not image.encoded or not np.isfinite(T_world_cam).all():
+            return False
+        if not is_new(self._views(image.name), T_world_cam, self.apart):
+            return False
+        suffix = "png" if image.encoded.startswith(b"\x89PNG") else "jpg"
+        bare = CameraImage(image.name, image.stamp_ns, b"", image.model, image.T_cam_lidar, image.exposure_s)
+        kept = _Kept(bare, T_world_cam, f"{image.name}_{self.offered:06d}.{suffix}", len(image.encoded))
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / kept.file).write_bytes(image.encoded)  # scratch: no need to wait for the disk
+        self._kept.append(kept)
+        while self.size > self.budget_bytes and self._kept:
+            self._thin()
+        return any(item is kept for item in self._kept)
+
+    def save(self, map_folder: Path) -> int:
+        """Move them into ``map/keyframes`` and write the index; returns bytes written."""
+        into = map_folder / FOLDER
+        into.mkdir(parents=True, exist_ok=True)
+        for kept in self._kept:
+            (self.folder / kept.file).replace(into / kept.file)
+        content = (json.dumps({"photos": [_entry(kept) for kept in self._kept]}, indent=1) + "\n").encode()
+        write_bytes(into / INDEX, content)
+        return self.size + len(content)
+
+    def _views(self, camera: str) -> list[F64]:
+        return [kept.T_world_cam for kept in self._kept if kept.image.name == camera]
+
+    def _thin(self) -> None:
+        """Farther apart from now on; what is kept already is chosen anew, in order of time."""
+        before, self._kept = self._kept, []
+        self.apart = self.apart.scaled(_THINNING)
+        for kept in before:
+            if is_new(self._views(kept.image.name), kept.T_world_cam, self.apart):
+                self._kept.append(kept)
+            else:
+                (self.folder / kept.file).unlink()
+        if len(before) == 1:  # one photograph beyond the budget
+            for kept in self._kept:
+                (self.folder / kept.file).unlink()
+            self._kept = []
+
+
+def is_new(views: Sequence[F64], T_world_cam: F64, apart: Apart) -> bool:
+    """Whether a view (T_world_cam, z forward) differs from all of ``views``: moved and turned together count."""
+    if not views:
+        return True
+    stack = np.stack(views)
+    moved = np.linalg.norm(stack[:, :3, 3] - T_world_cam[:3, 3], axis=1)
+    turned = np.arccos(np.clip(stack[:, :3, 2] @ T_world_cam[:3, 2], -1.0, 1.0))
+    return bool(np.all(moved / apart.metres + turned / apart.radians >= 1.0))
+
+
+def _entry(kept: _Kept) -> dict[str, Any]:
+    model = kept.image.model
+    return {
+        "file": kept.file,
+        "camera": kept.image.name,
+        "stamp_ns": kept.image.stamp_ns,
+        "width": model.width,
+        "height": model.height,
+        "fx": model.fx,
+        "fy": model.fy,
+        "cx": model.cx,
+        "cy": model.cy,
+        "distortion": list(model.distortion),
+        "T_cam_world": inverse(kept.T_world_cam).tolist(),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A photograph of a finished map: its file, camera and pose."""
+
+    file: Path
+    camera: str
+    stamp_ns: int
+    model: CameraModel
+    T_world_cam: F64
+
+
+def read_keyframes(map_folder: Path) -> list[Keyframe]:
+    """The photographs of a map (its ``map`` folder), in order of time.
+
+    Raises InputError where none were kept or the index cannot be read.
+    """
+    for index in (map_folder / FOLDER / INDEX, map_folder / _OTHER_INDEX):
+        if index.is_file():
+            try:
+                rows = json.loads(index.read_text("utf-8"))["photos"]
+                found = [_keyframe(index.parent, row) for row in rows]
+            except (ValueError, KeyError, TypeError, OSError) as error:
+                raise InputError(f"{index} cannot be read ({error}); map the recording again") from None
+            return sorted(found, key=lambda item: (item.stamp_ns, item.camera))
+    raise InputError(
+        f"{map_folder} has no photographs to look at; map a recording that has images, with --query TEXT"
+    )
+
+
+def _keyframe(folder: Path, row: dict[str, Any]) -> Keyframe:
+    path = folder / str(row["file"])
+    T_cam_world = np.array(row["T_cam_world"], np.float64)
+    k1, k2, p1, p2, k3 = (float(value) for value in row["distortion"])
+    if T_cam_world.shape != (4, 4):
+        raise ValueError("a pose is no 4 x 4 matrix")
+    width, height = int(row.get("width", 0)), int(row.get("height", 0))
+    if not width or not height:
+        pixels = decode(path.read_bytes())
+        height, width = (0, 0) if pixels is None else pixels.shape[:2]
+    fx, fy, cx, cy = (float(row[key]) for key in ("fx", "fy", "cx", "cy"))
+    model = CameraModel(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    camera, stamp = str(row.get("camera", path.stem)), int(row.get("stamp_ns", 0))
+    return Keyframe(path, camera, stamp, model, inverse(T_cam_world))
+
+
+def segment_all(
+    keyframes: Sequence[Keyframe],
+    backend: Backend,
+    prompts: Sequence[Prompt],
+    report: Report = silent,
+    refuse: Callable[[str], None] = lambda sentence: None,
+) -> Iterator[tuple[Keyframe, Segmentation]]:
+    """Look for the prompts in every keyframe, in order; ``refuse`` is told of photographs that cannot be used."""
+    for done, keyframe in enumerate(keyframes, start=1):
+        image = _pixels(keyframe, refuse)
+        if image is not None:
+            yield keyframe, backend.segment(image, prompts)
+        report(done, len(keyframes), keyframe.camera)
+
+
+def _pixels(keyframe: Keyframe, refuse: Callable[[str], None]) -> U8 | None:
+    try:
+        image = decode(keyframe.file.read_bytes())
+    except OSError as error:
+        refuse(f"cannot read {keyframe.file}: {error.strerror}")
+        return None
+    if image is None:
+        refuse(f"{keyframe.file} is not a photograph that can be read")
+    elif image.shape[:2] != (keyframe.model.height, keyframe.model.width):
+        refuse(f"{keyframe.file} is not of the size of its camera")
+        return None
+    return image
