@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from artemis_edge.commands import models, output, rig, session, texture
+from artemis_edge.commands import models, output, rig, session, texture, tui
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -138,6 +138,12 @@ def _demo(commands: Any) -> None:
         "--seconds", type=float, default=_DEMO_SECONDS, help="length of the walk (default: 20)"
     )
     parser.add_argument("--out", type=Path, default=DEMO_OUT, metavar="DIR", help="default: ./demo-out")
+    parser.add_argument(
+        "--tui",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="watch the mesh grow in the terminal",
+    )
 
 
 def _simulate(commands: Any) -> None:
@@ -241,6 +247,8 @@ def run_demo(given: argparse.Namespace) -> int:
     """``artemis-edge demo``."""
     from artemis_edge.session.demo import demo
 
+    if given.tui:
+        return tui.run_demo(given, _SEED)
     print(demo(given.world, given.seconds, _SEED, given.out))
     return DONE
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +15,8 @@ from artemis_edge.evaluate.mesh import Comparison, evaluate_mesh
 from artemis_edge.evaluate.trajectory import evaluate_trajectory
 from artemis_edge.export.ply import Mesh, read_mesh
 from artemis_edge.frames import F32, F64, Trajectory
-from artemis_edge.progress import progress, say
-from artemis_edge.runtime import Outcome, Request, reprocess
+from artemis_edge.progress import Report, progress, say
+from artemis_edge.runtime import MakeMapper, Outcome, Request, pipeline, reprocess
 from artemis_edge.session.report import Evaluation
 from artemis_edge.session.results import prepare
 from artemis_edge.session.simulate import simulate
@@ -28,20 +30,31 @@ _SETTINGS = {"reference_spacing_m": "0.04", "image_width": "640"}
 NEAR_M = 30.0
 
 
-def demo(world: str, seconds: float, seed: int, out: Path) -> str:
+#: Gives a Report for a piece of work that has a name.
+Reporter = Callable[[str], AbstractContextManager[Report]]
+
+
+def demo(
+    world: str,
+    seconds: float,
+    seed: int,
+    out: Path,
+    make: MakeMapper = pipeline,
+    reporter: Reporter = progress,
+) -> str:
     """Write session and results to ``out``; returns what to print. Raises UserError as its parts do."""
     prepare(out)
     session = out / SESSION
     prepare(session)
     say(f"recording a walk of {seconds:g} s through the virtual world '{world}'")
-    with progress("recording") as report:
+    with reporter("recording") as report:
         made = simulate(world, seed, seconds, "avia", session, _SETTINGS, report)
     for note in made.notes:
         say(f"note: {note}")
     say("mapping it by its own odometry (the truth is only for measuring)")
     request = Request(session, out, own_odometry=True)
-    with progress("mapping") as report:
-        outcome = reprocess(request, report, lambda mesh, path: measure(mesh, path, made.truth))
+    with reporter("mapping") as report:
+        outcome = reprocess(request, report, lambda mesh, path: measure(mesh, path, made.truth), make)
     return _closing(outcome, made.length_m)
 
 

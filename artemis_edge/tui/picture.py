@@ -1,0 +1,171 @@
+"""A picture of the growing mesh, small enough for a terminal: vertices as splats, seen from behind or from above.
+
+In a terminal a pixel is a decimetre or more, and vertices lie that close; triangles would show nothing further.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from artemis_edge.frames import F32, F64, I64, U8, MeshDelta
+
+Kind = Literal["behind", "above"]
+
+MOST_VERTICES = 400_000  # drawn at a time: 25 ms of numpy
+SKY = (12, 14, 20)
+_GREY = 180
+_DIM = 0.45  # what is not asked for steps back while something is highlighted
+_TILT = np.deg2rad(35.0)  # how steeply one looks down from behind
+_BEHIND_M = 9.0
+_FOV = 1.1  # focal length over half the width: 85 degrees across
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    position: F32
+    colour: U8
+    label: U8
+
+
+class MapCopy:
+    """The newest vertices of every block that was told."""
+
+    def __init__(self) -> None:
+        self._blocks: dict[tuple[int, int, int], _Block] = {}
+        self._merged: _Block | None = None
+
+    def apply(self, delta: MeshDelta) -> None:
+        """Take over the blocks of a delta."""
+        for k, block in enumerate(delta.block.tolist()):
+            rows = slice(int(delta.vertex_start[k]), int(delta.vertex_start[k + 1]))
+            shaded = _shaded(delta.colour[rows], delta.normal[rows])
+            self._blocks[tuple(block)] = _Block(delta.position[rows].copy(), shaded, delta.label[rows].copy())
+        self._merged = None
+
+    def __len__(self) -> int:
+        return sum(len(block.label) for block in self._blocks.values())
+
+    def points(self) -> tuple[F32, U8, U8]:
+        """Positions (n, 3), colours (n, 3) and labels (n,), thinned evenly to ``MOST_VERTICES``."""
+        if self._merged is None:
+            blocks = list(self._blocks.values()) or [_Block(*_nothing())]
+            step = max(1, -(-len(self) // MOST_VERTICES))
+            self._merged = _Block(
+                np.concatenate([b.position[::step] for b in blocks]),
+                np.concatenate([b.colour[::step] for b in blocks]),
+                np.concatenate([b.label[::step] for b in blocks]),
+            )
+        return self._merged.position, self._merged.colour, self._merged.label
+
+
+def _nothing() -> tuple[F32, U8, U8]:
+    return np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8), np.empty(0, np.uint8)
+
+
+def _shaded(colour: U8, normal: F32) -> U8:
+    """Colours no camera has seen are shaded by direction and told apart: floors greenish, walls bluish."""
+    grey = (colour == _GREY).all(axis=1)
+    if not grey.any():
+        return colour.copy()
+    out = colour.copy()
+    up = np.abs(normal[grey, 2])[:, None]
+    light = 0.55 + 0.45 * np.abs(normal[grey] @ np.array([0.5, 0.3, 0.81], np.float32))[:, None]
+    wall, floor = np.array([150, 165, 190], np.float32), np.array([140, 170, 130], np.float32)
+    out[grey] = (light * (wall * (1.0 - up) + floor * up)).astype(np.uint8)
+    return out
+
+
+def draw(
+    copy: MapCopy,
+    width: int,
+    height: int,
+    position: tuple[float, float, float],
+    yaw: float,
+    kind: Kind = "behind",
+    span_m: float = 40.0,
+    colours: dict[int, tuple[int, int, int]] | None = None,
+) -> U8:
+    """Picture uint8 (height, width, 3). ``colours`` are those of highlighted labels; ``span_m`` is shown across.
+
+    Pixels are square. From above north (y) is up; the operator is drawn as a bright cross.
+    """
+    points, shade, label = copy.points()
+    image = np.full((height, width, 3), SKY, np.uint8)
+    view = _above if kind == "above" else _behind
+    u, v, depth = view(points, width, height, np.array(position), yaw, span_m)
+    seen = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (depth > 0.3)
+    shade = highlight(shade, label, colours or {})
+    rows = np.flatnonzero(seen)
+    order = rows[np.argsort(-depth[rows], kind="stable")]  # the nearest is drawn last
+    flat = v[order].astype(np.int64) * width + u[order].astype(np.int64)
+    image.reshape(-1, 3)[flat] = _fogged(shade[order], depth[order], span_m, kind)
+    if kind == "above":
+        _mark(image, width // 2, height // 2)
+    return image
+
+
+def highlight(shade: U8, label: U8, colours: dict[int, tuple[int, int, int]]) -> U8:
+    """Labels in ``colours`` glow in theirs, all else steps back; unchanged where nothing is asked."""
+    if not colours:
+        return shade
+    out = (shade * _DIM).astype(np.uint8)
+    for number, colour in colours.items():
+        rows = label == number
+        mixed = 0.25 * shade[rows] + 0.75 * np.array(colour, np.float32)
+        out[rows] = mixed.astype(np.uint8)
+    return out
+
+
+def _above(
+    points: F32, width: int, height: int, position: F64, yaw: float, span_m: float
+) -> tuple[F64, F64, F64]:
+    scale = width / span_m
+    relative = points - position
+    u = np.floor(width / 2 + relative[:, 0] * scale)
+    v = np.floor(height / 2 - relative[:, 1] * scale)
+    return u, v, 100.0 - relative[:, 2]
+
+
+def _behind(
+    points: F32, width: int, height: int, position: F64, yaw: float, span_m: float
+) -> tuple[F64, F64, F64]:
+    """A camera behind and above the operator, looking ahead and down."""
+    ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    distance = _BEHIND_M * span_m / 40.0
+    eye = position - ahead * distance * np.cos(_TILT) + (0, 0, distance * np.sin(_TILT))
+    forward = ahead * np.cos(_TILT) - np.array([0, 0, np.sin(_TILT)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    down = np.cross(forward, right)
+    relative = points - eye
+    depth = relative @ forward
+    focal = 0.5 * width * _FOV
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = np.floor(width / 2 + focal * (relative @ right) / depth)
+        v = np.floor(height / 2 + focal * (relative @ down) / depth)
+    return u, v, depth
+
+
+def _fogged(shade: U8, depth: F64, span_m: float, kind: Kind) -> U8:
+    """What is far fades towards the sky, so that near and far are told apart without colour too."""
+    if kind == "above" or len(depth) == 0:
+        return shade
+    share = np.clip(depth / (1.5 * span_m), 0.0, 0.7)[:, None]
+    return (shade * (1.0 - share) + np.array(SKY) * share).astype(np.uint8)
+
+
+def _mark(image: U8, u: int, v: int) -> None:
+    height, width = image.shape[:2]
+    for du, dv in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+        if 0 <= u + du < width and 0 <= v + dv < height:
+            image[v + dv, u + du] = (255, 255, 255)
+
+
+def luminance_text(image: U8) -> list[str]:
+    """The picture as plain characters, two rows of pixels a line: for terminals without colour."""
+    ramp = " .:-=+*#%@"
+    pairs = image[: len(image) // 2 * 2].reshape(-1, 2, image.shape[1], 3).mean(axis=(1, 3))
+    level: I64 = (pairs / 256.0 * len(ramp)).astype(np.int64)
+    return ["".join(ramp[k] for k in row) for row in level]

@@ -1,0 +1,226 @@
+"""The parts of the live page. Each shows one part of a Status and keeps nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.segment import Segment
+from rich.style import Style
+from rich.text import Text
+from textual.app import RenderResult
+from textual.strip import Strip
+from textual.widget import Widget
+from textual.widgets import DataTable, Static
+
+from artemis_edge.frames import U8
+from artemis_edge.status import QueryStatus, Status
+from artemis_edge.tui.picture import luminance_text
+
+BUDGET_MS = 100.0  # a frame of a LiDAR at 10 Hz
+_BARS = "▁▂▃▄▅▆▇█"
+_HALF = "▀"
+_LOW_MINUTES, _LEAST_MINUTES = 15.0, 5.0
+
+
+class MeshPicture(Widget):
+    """A picture in half blocks: every character is two pixels, one above the other."""
+
+    DEFAULT_CSS = "MeshPicture { height: 1fr; min-height: 6; background: #0c0e14; }"
+
+    def __init__(self, colour: bool = True, id: str | None = None) -> None:
+        super().__init__(id=id)
+        self._colour = colour
+        self._lines: list[Strip] = []
+        self.caption = ""
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height that fill the widget."""
+        return max(self.size.width, 1), max(self.size.height, 1) * 2
+
+    def show(self, image: U8) -> None:
+        """Take over a picture uint8 (h, w, 3); h is even."""
+        if self._colour:
+            self._lines = [_strip(image[r], image[r + 1]) for r in range(0, len(image) - 1, 2)]
+        else:
+            self._lines = [Strip([Segment(line)]) for line in luminance_text(image)]
+        self.refresh()
+
+    def render_line(self, y: int) -> Strip:
+        """One line of characters."""
+        if y == 0 and self.caption:
+            return Strip([Segment(f" {self.caption} ", Style(bold=True, reverse=True))]).adjust_cell_length(
+                self.size.width
+            )
+        line = self._lines[y] if y < len(self._lines) else Strip.blank(self.size.width)
+        return line.adjust_cell_length(self.size.width)
+
+
+def _strip(top: U8, bottom: U8) -> Strip:
+    """Runs of equal colours become one segment: a line is some tens of them, not hundreds."""
+    pair = np.concatenate((top, bottom), axis=1).astype(np.int64)
+    ends = np.flatnonzero(np.concatenate(((pair[1:] != pair[:-1]).any(axis=1), [True]))) + 1
+    start, segments = 0, []
+    for end in ends.tolist():
+        r, g, b, r2, g2, b2 = pair[start].tolist()
+        style = Style.from_color(_rgb(r, g, b), _rgb(r2, g2, b2))
+        even = (r, g, b) == (r2, g2, b2)
+        segments.append(Segment((" " if even else _HALF) * (end - start), style))
+        start = end
+    return Strip(segments, len(pair))
+
+
+def _rgb(r: int, g: int, b: int):  # type: ignore[no-untyped-def]
+    from rich.color import Color
+
+    return Color.from_rgb(r, g, b)
+
+
+class FrameTimes(Static):
+    """A sparkline of the latest frames' times against the 100 ms line."""
+
+    def show(self, status: Status) -> None:
+        """Redraw for a status."""
+        self.update(frame_times(status.frame_ms, max(self.size.width - 22, 10)))
+
+
+def frame_times(times: list[float], width: int) -> Text:
+    """Bars scaled so that a full one is the budget; red above it."""
+    latest = times[-width:]
+    text = Text()
+    for ms in latest:
+        level = min(int(ms / BUDGET_MS * (len(_BARS) - 1)), len(_BARS) - 1)
+        text.append(
+            _BARS[level], style="red" if ms > BUDGET_MS else "yellow" if ms > 0.7 * BUDGET_MS else "green"
+        )
+    if not latest:
+        return Text("no frame yet", style="dim")
+    middle, worst = float(np.median(latest)), max(latest)
+    text.append(f" {middle:.0f} ms, at most {worst:.0f}", style="bold red" if worst > BUDGET_MS else "")
+    return text
+
+
+class Streams(DataTable[Text]):
+    """One row a sensor: rate, losses, state."""
+
+    def on_mount(self) -> None:
+        """Columns."""
+        self.cursor_type = "none"
+        self.show_cursor = False
+        self.zebra_stripes = False
+        for title in ("sensor", "Hz", "lost", "state"):
+            self.add_column(title, key=title)
+
+    def show(self, status: Status) -> None:
+        """Redraw for a status."""
+        self.clear()
+        for s in status.streams:
+            slow = s.expected_hz > 0.0 and s.hz < 0.8 * s.expected_hz
+            bad = s.state in ("failed", "silent")
+            style = "bold red" if bad else "yellow" if slow or s.lost else "green"
+            self.add_row(
+                Text(s.name),
+                Text(f"{s.hz:.0f}/{s.expected_hz:.0f}" if s.expected_hz else f"{s.hz:.0f}", style=style),
+                Text(str(s.lost), style="yellow" if s.lost else "dim"),
+                Text(s.message or s.state, style=style),
+            )
+
+
+class Queries(DataTable[Text]):
+    """The live questions: colour, count, best score; Enter goes to the next of its objects."""
+
+    def on_mount(self) -> None:
+        """Columns."""
+        self.cursor_type = "row"
+        for title in ("", "query", "n", "best", "status"):
+            self.add_column(title, key=title or "colour")
+
+    def show(self, queries: list[QueryStatus]) -> None:
+        """Redraw, the cursor stays where it is."""
+        row = self.cursor_row
+        self.clear()
+        for q in queries:
+            found = q.count > 0
+            self.add_row(
+                Text("██", style=f"rgb({q.colour[0]},{q.colour[1]},{q.colour[2]})"),
+                Text(q.text[:40]),
+                Text(str(q.count), style="bold" if found else "dim"),
+                Text(f"{q.score:.2f}" if found else "-"),
+                Text(q.status + (f": {q.note}" if q.note else ""), style="green" if found else "dim"),
+                key=q.text,
+            )
+        if queries:
+            self.move_cursor(row=min(row, len(queries) - 1))
+
+
+class Gauges(Static):
+    """State, time, map, disk and battery in two lines."""
+
+    def show(self, status: Status) -> None:
+        """Redraw for a status."""
+        self.update(gauges(status))
+
+
+def gauges(status: Status) -> RenderResult:
+    """Two lines that fit 78 columns."""
+    styles = {"recording": "bold white on red", "fault": "bold white on red", "saving": "black on yellow"}
+    text = Text()
+    text.append(f" {status.state.upper()} ", style=styles.get(status.state, "reverse"))
+    minutes, seconds = divmod(int(status.seconds), 60)
+    text.append(f" {minutes:02d}:{seconds:02d}  ")
+    frames = f"{status.frames}/{status.frames_total}" if status.frames_total else str(status.frames)
+    text.append(f"frame {frames}  ")
+    text.append(f"{status.dropped} dropped  ", style="bold red" if status.dropped else "dim")
+    text.append(f"{status.map.vertices:,} vertices  {status.map.area_m2:,.0f} m2\n")
+    text.append_text(_left("disk", status.disk_minutes))
+    text.append_text(_left("battery", status.battery_minutes))
+    text.append_text(_synchronised(status))
+    if status.map.resident_mb:
+        text.append(f"{status.map.resident_mb:.0f} MB  ")
+    if status.segmentation_hz:
+        text.append(f"masks {status.segmentation_hz:.1f} Hz  ")
+    if status.overload:
+        text.append("reduced: " + ", ".join(status.overload), style="yellow")
+    return text
+
+
+def _synchronised(status: Status) -> Text:
+    sync = status.sync
+    if sync.state == "none":
+        return Text("clocks not locked  ", style="dim")
+    style = "green" if sync.state == "locked" else "yellow"
+    return Text(f"clocks {sync.state} {sync.offset_ms:+.2f} ms  ", style=style)
+
+
+def _left(name: str, minutes: float | None) -> Text:
+    if minutes is None:
+        return Text(f"{name} not known  ", style="dim")
+    style = "bold red" if minutes < _LEAST_MINUTES else "yellow" if minutes < _LOW_MINUTES else "green"
+    return Text(f"{name} {minutes:.0f} min  ", style=style)
+
+
+class Advice(Static):
+    """What the operator should know or do now, the gravest first."""
+
+    def show(self, status: Status) -> None:
+        """Redraw for a status."""
+        self.update(advice(status))
+
+
+def advice(status: Status) -> Text:
+    """One line each; empty when all is well."""
+    text = Text()
+    if status.state == "fault":
+        text.append(f"{status.message}\n", style="bold red")
+    if status.degenerate:
+        text.append("few walls in view: the position is held by IMU and camera\n", style="bold yellow")
+    for sentence in status.coaching:
+        text.append(f"{sentence}\n", style="bold yellow")
+    for stream in status.streams:
+        if stream.message and stream.state in ("failed", "silent"):
+            text.append(f"{stream.name}: {stream.message}\n", style="red")
+    lost = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in status.losses.items() if n)
+    if lost:
+        text.append(f"lost so far: {lost}\n", style="yellow")
+    if status.state not in ("fault",) and status.message:
+        text.append(status.message, style="dim")
+    return text

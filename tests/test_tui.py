@@ -1,0 +1,356 @@
+"""The terminal: pages by pilot, pictures by hand, and a whole session against a remote that is told what to say."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from textual.pilot import Pilot
+from textual.widgets import DataTable, Input, Static
+
+from artemis_edge import check
+from artemis_edge.commands.tui import read_keys
+from artemis_edge.errors import InputError
+from artemis_edge.frames import MeshDelta
+from artemis_edge.newest import Newest, joined
+from artemis_edge.status import MapStatus, QueryStatus, Status, Stream, SyncStatus
+from artemis_edge.tui.app import ArtemisTui, LivePage
+from artemis_edge.tui.history import History
+from artemis_edge.tui.pages import recordings
+from artemis_edge.tui.picture import SKY, MapCopy, draw, luminance_text
+from artemis_edge.tui.remote import RemoteError
+from artemis_edge.tui.widgets import MeshPicture, advice, frame_times, gauges
+
+FULL = Status(
+    state="recording",
+    seconds=83.4,
+    frames=834,
+    dropped=2,
+    streams=[
+        Stream("lidar_0", 240_000, 240_000, 0, state="running"),
+        Stream("cam_0", 6.0, 10.0, 3, state="running"),
+        Stream("imu", 0.0, 400.0, 0, state="silent", message="no data for 2 s: plug it in again"),
+    ],
+    sync=SyncStatus("locked", 0.12, {"imu": 18.0}),
+    map=MapStatus(120_000, 200_000, 812.0, 640.0),
+    frame_ms=[20.0, 60.0, 80.0, 130.0],
+    disk_minutes=12.0,
+    battery_minutes=4.0,
+    degenerate=True,
+    coaching=["turn slower"],
+    losses={"packets": 3},
+    queries=[
+        QueryStatus("bench", "matched", 2, 0.91, (255, 0, 0), places=[(1.0, 2.0, 0.0), (5.0, 5.0, 0.0)]),
+        QueryStatus("unicorn", "unsupported", note="no model knows it", colour=(0, 255, 0)),
+    ],
+    overload=["preview"],
+)
+
+
+def delta(block: tuple[int, int, int], points: np.ndarray, label: int = 0, index: int = 0) -> MeshDelta:
+    n = len(points)
+    return MeshDelta(
+        index=index,
+        block=np.array([block], np.int32),
+        vertex_start=np.array([0, n]),
+        triangle_start=np.array([0, 1]),
+        vertex_id=np.arange(n),
+        position=np.asarray(points, np.float32),
+        normal=np.tile(np.array([0, 0, 1], np.float32), (n, 1)),
+        colour=np.full((n, 3), 200, np.uint8),
+        label=np.full(n, label, np.uint8),
+        confidence=np.ones(n, np.float32),
+        triangles=np.array([[0, 1, 2]]),
+    )
+
+
+class Fake:
+    """A remote that says what it is given and remembers what it was told."""
+
+    name = "test"
+
+    def __init__(self, status: Status = FULL) -> None:
+        self.now = status
+        self.news = [delta((0, 0, 0), np.random.default_rng(1).uniform(-5, 5, (3000, 3)), 1)]
+        self.told: list[str] = []
+        self.fault = ""
+
+    def status(self) -> Status:
+        if self.fault:
+            raise RemoteError(self.fault)
+        return self.now
+
+    def deltas(self) -> list[MeshDelta]:
+        news, self.news = self.news, []
+        return news
+
+    def ask(self, text: str) -> str:
+        self.told.append(f"ask {text}")
+        return f"looking for '{text}'"
+
+    def forget(self, text: str) -> str:
+        self.told.append(f"forget {text}")
+        return ""
+
+    def command(self, name: str) -> str:
+        self.told.append(name)
+        return name
+
+    def close(self) -> None:
+        self.told.append("close")
+
+
+def run(
+    app: ArtemisTui, script: Callable[[Pilot[None]], Awaitable[None]], size: tuple[int, int] = (80, 24)
+) -> None:
+    async def all_of_it() -> None:
+        async with app.run_test(size=size) as pilot:
+            await pilot.pause(0.6)
+            await script(pilot)
+
+    asyncio.run(all_of_it())
+
+
+async def settled(pilot: Pilot[None], true: Callable[[], bool]) -> None:
+    """Wait until something holds: what threads do is not counted in steps."""
+    for _ in range(100):
+        if true():
+            return
+        await pilot.pause(0.05)
+    raise AssertionError("it never came to that")
+
+
+def live(app: ArtemisTui) -> LivePage:
+    page = app.get_screen("live")
+    assert isinstance(page, LivePage)
+    return page
+
+
+@pytest.mark.parametrize("size", [(80, 24), (160, 48)])
+@pytest.mark.parametrize("colour", [True, False])
+def test_live_page_shows_everything(size: tuple[int, int], colour: bool, tmp_path: Path) -> None:
+    app = ArtemisTui(Fake(), tmp_path, colour)
+
+    async def script(pilot: Pilot[None]) -> None:
+        await settled(pilot, lambda: live(app).query_one("#queries", DataTable).row_count == 2)
+        assert live(app).query_one("#streams", DataTable).row_count == 3
+        picture = live(app).query_one(MeshPicture)
+        assert picture.size.width >= 30 and picture.size.height >= 6
+        live(app).redraw()
+        text = "".join(strip.text for strip in picture._lines)
+        assert any(c not in " " for c in text), "the map is drawn"
+        shown = app.export_screenshot()
+        for words in ("RECORDING", "bench", "lidar_0", "turn&#160;slower"):
+            assert words in shown
+
+    run(app, script, size)
+
+
+def test_ask_recall_jump_and_forget(tmp_path: Path) -> None:
+    remote = Fake()
+    app = ArtemisTui(remote, tmp_path, history=History(tmp_path / "history"))
+
+    async def script(pilot: Pilot[None]) -> None:
+        await settled(pilot, lambda: live(app).query_one("#queries", DataTable).row_count == 2)
+        await pilot.press("slash", *"red car", "enter")
+        await settled(pilot, lambda: remote.told == ["ask red car"])
+        await pilot.press("slash", "up")
+        assert live(app).query_one(Input).value == "red car"
+        await pilot.press("down")
+        assert live(app).query_one(Input).value == ""
+        await pilot.press("escape", "enter")
+        assert live(app)._look_at == (1.0, 2.0, 0.0)
+        await pilot.press("enter")
+        assert live(app)._look_at == (5.0, 5.0, 0.0), "the next object"
+        await pilot.press("escape")
+        assert live(app)._look_at is None
+        await pilot.press("down", "delete")
+        await settled(pilot, lambda: remote.told[-1] == "forget unicorn")
+
+    run(app, script)
+    assert History(tmp_path / "history").lines == ["red car"]
+
+
+def test_start_stop_mark_view_and_zoom(tmp_path: Path) -> None:
+    remote = Fake()
+    app = ArtemisTui(remote, tmp_path, keymap={"mark": "k"})
+
+    async def script(pilot: Pilot[None]) -> None:
+        await pilot.press("r", "s", "k")
+        await settled(pilot, lambda: sorted(remote.told) == ["mark", "start", "stop"])
+        await pilot.press("v", "plus")
+        assert live(app).view == "above" and live(app).span_m == pytest.approx(28.0)
+        for _ in range(20):
+            await pilot.press("minus")
+        assert live(app).span_m == 320.0
+
+    run(app, script)
+
+
+def test_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [check.Finding("disk", "warn", "1 GB free"), check.Finding("clock", "fail", "no pulse")]
+    monkeypatch.setattr(check, "check", lambda: found)
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "session.mcap").write_bytes(b"no recording")
+    app = ArtemisTui(Fake(), tmp_path)
+
+    async def script(pilot: Pilot[None]) -> None:
+        await pilot.press("2")
+        await settled(pilot, lambda: app.screen.query_one(DataTable).row_count == 2)
+        assert "1 to mend" in str(app.screen.query_one("#summary", Static).render())
+        assert str(app.screen.query_one(DataTable).get_row_at(0)[1]) == "clock", "the gravest first"
+        await pilot.press("3")
+        await settled(pilot, lambda: app.screen.query_one(DataTable).row_count == 1)
+        card = app.screen.query_one("#card", Static)
+        await settled(pilot, lambda: "session.mcap" in str(card.render()) or "MCAP" in str(card.render()))
+        await pilot.press("question_mark")
+        assert "Walking" in app.export_screenshot()
+        await pilot.press("1")
+        assert isinstance(app.screen, LivePage)
+
+    run(app, script)
+
+
+def test_a_remote_that_goes_and_comes_back(tmp_path: Path) -> None:
+    remote = Fake()
+    app = ArtemisTui(remote, tmp_path)
+
+    async def script(pilot: Pilot[None]) -> None:
+        remote.fault = "the service does not answer; is it running?"
+        await settled(pilot, lambda: app.status.state == "fault")
+        assert "does not answer" in app.status.message
+        remote.fault = ""
+        await settled(pilot, lambda: app.status.state == "recording")
+
+    run(app, script)
+
+
+def test_the_report_opens_when_there_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    remote = Fake()
+    app = ArtemisTui(remote, tmp_path)
+    opened: list[str] = []
+    monkeypatch.setattr(app, "open_url", lambda url, **_: opened.append(url))
+
+    async def script(pilot: Pilot[None]) -> None:
+        await pilot.press("o")
+        assert opened == []
+        remote.now = Status(state="done", report=str(tmp_path / "report.html"))
+        await settled(pilot, lambda: app.status.report != "")
+        await pilot.press("o")
+        assert opened == [(tmp_path / "report.html").resolve().as_uri()]
+
+    run(app, script)
+
+
+# --- the parts
+
+
+def test_nearest_and_highlighted_vertices_win() -> None:
+    copy = MapCopy()
+    copy.apply(delta((0, 0, 0), np.array([[3.0, 0, 0], [3.0, 0, 1.0], [0, 3.0, 0]])))
+    image = draw(copy, 21, 21, (0, 0, 0), 0.0, "above", 21.0)
+    assert tuple(image[10, 13]) == (200, 200, 200), "3 m east of the middle"
+    assert tuple(image[7, 10]) == (200, 200, 200), "3 m north"
+    assert tuple(image[10, 10]) == (255, 255, 255), "oneself"
+    assert tuple(image[0, 0]) == SKY
+    copy.apply(delta((0, 0, 0), np.array([[0, 3.0, 0]]), label=2))
+    image = draw(copy, 21, 21, (0, 0, 0), 0.0, "above", 21.0, {2: (255, 0, 0)})
+    assert tuple(image[10, 13]) == SKY, "the block's newest state has replaced the older"
+    assert image[7, 10, 0] > 200 > image[7, 10, 1]
+
+
+def test_what_is_ahead_is_drawn_and_what_is_behind_is_not() -> None:
+    for ahead, seen in ((8.0, True), (-60.0, False)):
+        copy = MapCopy()
+        copy.apply(delta((0, 0, 0), np.array([[0.0, ahead, 0.0]])))
+        image = draw(copy, 40, 40, (0, 0, 0), np.pi / 2, "behind", 40.0)
+        assert bool((image != SKY).any()) is seen
+
+
+@pytest.mark.parametrize("kind", ["above", "behind"])
+def test_an_empty_map_and_strange_points_draw(kind: str) -> None:
+    copy = MapCopy()
+    assert (draw(copy, 8, 8, (0, 0, 0), 0.0, "behind") == SKY).all()
+    copy.apply(delta((0, 0, 0), np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e30, 0, 0]])))
+    with np.errstate(all="ignore"):
+        assert draw(copy, 8, 8, (0, 0, 0), 0.0, kind).shape == (8, 8, 3)  # type: ignore[arg-type]
+
+
+def test_text_without_colour_has_a_line_for_two_rows() -> None:
+    image = np.zeros((5, 3, 3), np.uint8)
+    image[0:2] = 255
+    assert luminance_text(image) == ["@@@", "   "]
+
+
+def test_sentences_for_the_operator() -> None:
+    text = advice(FULL).plain
+    assert (
+        text.index("few walls")
+        < text.index("turn slower")
+        < text.index("imu: no data")
+        < text.index("3 packets")
+    )
+    assert "disk 12 min" in str(gauges(FULL)) and "battery 4 min" in str(gauges(FULL))
+    assert "disk not known" in str(gauges(Status()))
+    assert "at most 130" in frame_times([20.0, 130.0], 40).plain
+    assert frame_times([], 40).plain == "no frame yet"
+    assert advice(Status()).plain == ""
+
+
+def test_newest_keeps_one_state_of_a_block() -> None:
+    newest = Newest()
+    assert newest.take() is None
+    for index, (block, count) in enumerate([((0, 0, 0), 3), ((1, 0, 0), 4), ((0, 0, 0), 5)]):
+        newest.add(delta(block, np.full((count, 3), float(index)), index=index))
+    assert len(newest) == 2
+    first = newest.take(1)
+    assert first is not None and first.block.tolist() == [[1, 0, 0]] and len(first.position) == 4
+    second = newest.take()
+    assert second is not None and second.vertex_start.tolist() == [0, 5] and (second.position == 2.0).all()
+    assert newest.take() is None
+
+
+def test_joined_blocks_are_those_that_went_in() -> None:
+    parts = [(delta((k, 0, 0), np.full((k + 3, 3), float(k)), index=k), 0) for k in range(3)]
+    whole = joined(parts)
+    assert whole.vertex_start.tolist() == [0, 3, 7, 12] and whole.triangle_start.tolist() == [0, 1, 2, 3]
+    for k, (part, _) in enumerate(parts):
+        rows = slice(int(whole.vertex_start[k]), int(whole.vertex_start[k + 1]))
+        np.testing.assert_array_equal(whole.position[rows], part.position)
+    assert whole.index == 2
+
+
+def test_keys_file(tmp_path: Path) -> None:
+    file = tmp_path / "keys.toml"
+    assert read_keys(file) == {}
+    file.write_text('ask = "a"\n')
+    assert read_keys(file) == {"ask": "a"}
+    for text, says in (("ask = 3", "ask should be the name"), ("ask = ", "not valid TOML")):
+        file.write_text(text)
+        with pytest.raises(InputError, match=says):
+            read_keys(file)
+
+
+def test_history_survives_and_forgets_repetitions(tmp_path: Path) -> None:
+    file = tmp_path / "sub" / "history"
+    history = History(file)
+    for text in ("car", "bench", "  car  "):
+        history.add(text)
+    again = History(file)
+    assert again.lines == ["bench", "car"]
+    assert [again.step(-1), again.step(-1), again.step(-1), again.step(1), again.step(1)] == [
+        "car", "bench", "bench", "car", "",
+    ]  # fmt: skip
+    assert History(None).step(-1) == ""
+
+
+def test_recordings_are_found_newest_first(tmp_path: Path) -> None:
+    import os
+
+    for k, name in enumerate(("a/one.mcap", "b/two.mcap", "three.mcap")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+        os.utime(tmp_path / name, (k, k))
+    assert [p.name for p, _ in recordings(tmp_path)] == ["three.mcap", "b", "a"]
+    assert recordings(tmp_path / "nothing") == []
