@@ -220,7 +220,9 @@ class _Make:
     def __call__(self, config: Config, odometry: Odometry, folder: Path) -> Pipeline:
         self._made += 1
         if self._made == 1:
-            self._teller.say(message="getting ready; the very first time takes a minute or two", frames_total=0)
+            self._teller.say(
+                message="getting ready; the very first time takes a minute or two", frames_total=0
+            )
             return Pipeline(config, odometry, folder)
         return WatchedPipeline(config, odometry, folder, self._teller)
 
