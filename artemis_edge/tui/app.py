@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
@@ -10,6 +12,7 @@ from textual import on, work
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
+from textual.css.query import NoMatches
 from textual.reactive import reactive
 from textual.screen import Screen
 from textual.suggester import SuggestFromList
@@ -236,11 +239,11 @@ class ArtemisTui(App[None]):
             status = self._remote.status()
             deltas = self._remote.deltas()
         except RemoteError as error:
-            self.call_from_thread(self._lose, str(error))
+            self._show(self._lose, str(error))
             return
         for delta in deltas:
             self._copy.apply(delta)
-        self.call_from_thread(self._take, status)
+        self._show(self._take, status)
 
     @work(thread=True, group="command")
     def call(self, what: Callable[[Remote], str]) -> None:
@@ -248,10 +251,15 @@ class ArtemisTui(App[None]):
         try:
             answer = what(self._remote)
         except RemoteError as error:
-            self.call_from_thread(self.notify, str(error), severity="error")
+            self._show(self.notify, str(error), severity="error")
             return
         if answer:
-            self.call_from_thread(self.notify, answer)
+            self._show(self.notify, answer)
+
+    def _show(self, what: Callable[..., object], *arguments: object, **words: object) -> None:
+        """Call it in the application's thread; a page that is gone meanwhile needs no news."""
+        with contextlib.suppress(RuntimeError, NoMatches, concurrent.futures.CancelledError):
+            self.call_from_thread(what, *arguments, **words)
 
     def _take(self, status: Status) -> None:
         self._lost = ""
