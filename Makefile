@@ -7,7 +7,7 @@ OUT    ?= demo-out
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint bench soak clean
+.PHONY: help setup demo test lint bench soak viewer-test clean
 
 help:
 	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
@@ -15,6 +15,7 @@ help:
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   what a frame costs on this machine"
 	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
+	@echo "make viewer-test  exported GLB in three.js (fetches it with npm) in headless Chromium"
 	@echo "make setup   only create $(VENV); every target does it when needed"
 	@echo "make clean   remove $(VENV) and everything that was generated"
 
@@ -45,6 +46,11 @@ bench: $(READY)
 
 soak: $(READY)
 	@$(BIN)/python tests/soak/walk.py
+
+viewer-test: $(READY)
+	@command -v npm >/dev/null || { echo "npm is needed: on Debian and Ubuntu: apt install npm chromium"; exit 2; }
+	@cd tests/viewer && npm install --no-audit --no-fund --no-package-lock --silent
+	@$(BIN)/python -m pytest tests/viewer
 
 clean:
 	@rm -rf $(VENV) $(OUT) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -26,20 +26,39 @@ _MOST_SEEN = 255
 
 
 @njit
+def _seen_at(x: float, y: float, z: float, T_cam_world: F64, lens: Lens, nearest: F32) -> tuple[float, float]:
+    """Pixel u, v of a world point that the camera sees before depths ``nearest`` (h, w); NaN where it does not."""
+    height, width = nearest.shape
+    u, v, depth = place(x, y, z, T_cam_world, lens)
+    if -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
+        limit = nearest[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))]
+        if depth <= limit * (1.0 + _TOLERANCE) + _TOLERANCE_M:
+            return u, v
+    return np.nan, np.nan
+
+
+@njit
 def add_colours(
     points: F32, T_cam_world: F64, lens: Lens, nearest: F32, image: U8, sums: F32, seen: I64
 ) -> None:
     """Add the image's colour at every point it sees to ``sums`` float32 (n, 3), and 1 to ``seen`` (n,)."""
-    height, width = nearest.shape
     for i in range(len(points)):
-        u, v, z = place(points[i, 0], points[i, 1], points[i, 2], T_cam_world, lens)
-        if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+        u, v = _seen_at(points[i, 0], points[i, 1], points[i, 2], T_cam_world, lens, nearest)
+        if np.isnan(u):
             continue
         column, row = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
-        if z <= nearest[row, column] * (1.0 + _TOLERANCE) + _TOLERANCE_M:
-            for k in range(3):
-                sums[i, k] += image[row, column, k]
-            seen[i] += 1
+        for k in range(3):
+            sums[i, k] += image[row, column, k]
+        seen[i] += 1
+
+
+@njit
+def sees(points: F32, T_cam_world: F64, lens: Lens, nearest: F32) -> F64:
+    """Pixels float64 (n, 2) of points that the camera sees before depths ``nearest`` (h, w); NaN for the others."""
+    out = np.empty((len(points), 2))
+    for i in range(len(points)):
+        out[i] = _seen_at(points[i, 0], points[i, 1], points[i, 2], T_cam_world, lens, nearest)
+    return out
 
 
 def colour_points(folder: Path, report: Report = silent) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from artemis_edge.atlas_raster import find_texels, sample_page
@@ -16,6 +15,7 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.atlas import Atlas
 from artemis_edge.export.atomic import replacing, write_bytes
 from artemis_edge.export.ply import Mesh
+from artemis_edge.export.png import png_bytes
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraModel
 from artemis_edge.highlighted import highlighted_triangles
 from artemis_edge.lens import undistorted_lines
@@ -241,12 +241,6 @@ def run(
 def write_png(path: Path, image: U8) -> None:
     """Write RGB or RGBA uint8 (h, w, 3 or 4) as PNG."""
     write_bytes(path, png_bytes(image))
-
-
-def png_bytes(image: U8) -> bytes:
-    """RGB or RGBA uint8 (h, w, 3 or 4) as the bytes of a PNG."""
-    order = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    return bytes(cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(image), order))[1])
 
 
 def parse_pose(text: str) -> F64:

@@ -11,6 +11,7 @@ from artemis_edge.export.atlas import Atlas, empty_atlas, write_atlas
 from artemis_edge.export.corners import shared_corners
 from artemis_edge.export.glb import write_glb
 from artemis_edge.export.mesh import Mesh
+from artemis_edge.export.obj import write_obj
 from artemis_edge.export.ply import write_ply
 from tests.textured import square_room
 
@@ -53,7 +54,7 @@ def assert_looks_like(geometries: list[trimesh.Trimesh], mesh: Mesh, atlas: Atla
     """Every textured face is there once, and the middle of it has the colour of the atlas page."""
     found = 0
     for geometry in geometries:
-        if geometry.visual.kind != "texture":
+        if geometry.visual.uv is None:
             continue
         for number, corners in enumerate(geometry.triangles):
             x, y, z = corners.mean(axis=0)
@@ -75,8 +76,8 @@ def test_textured_glb_opens_elsewhere_with_its_texture(room: Path) -> None:
     geometries = list(scene.geometry.values())
     assert len(geometries) == 3 and sum(len(g.faces) for g in geometries) == len(mesh.faces)
     assert_looks_like(geometries, mesh, atlas)
-    floor = next(g for g in geometries if g.visual.kind == "vertex")
-    assert len(floor.faces) == 2 and len(np.unique(floor.visual.vertex_colors, axis=0)) == 4
+    (floor,) = (g for g in geometries if g.visual.uv is None)
+    assert len(floor.faces) == 2 and len(np.unique(floor.visual.vertex_attributes["color"], axis=0)) == 4
 
 
 def test_glb_is_the_same_twice_and_plain_on_request(room: Path) -> None:
@@ -97,3 +98,44 @@ def test_glb_is_the_same_twice_and_plain_on_request(room: Path) -> None:
 def test_export_into_a_folder_is_refused(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(room), "--format", "glb", "--out", str(room)]) == 2
     assert "needs the name of a file" in capsys.readouterr().err
+
+
+def test_obj_opens_elsewhere_with_its_texture(room: Path) -> None:
+    pytest.importorskip("PIL")
+    mesh, atlas = square_room()
+    assert main(["export", str(room), "--format", "obj", "--out", str(room / "a.obj")]) == 0
+    assert {p.name for p in room.glob("a*")} == {"a.obj", "a.mtl", "a_000.png", "a_001.png"}
+    scene = trimesh.load_scene(room / "a.obj", process=False)
+    geometries = list(scene.geometry.values())
+    assert sum(len(g.faces) for g in geometries) == len(mesh.faces)
+    found = 0
+    for geometry in geometries:
+        image = getattr(geometry.visual.material, "image", None)
+        if image is None:
+            continue
+        for corners, face in zip(geometry.triangles, geometry.faces, strict=True):
+            middle = mesh.vertices[mesh.faces].mean(axis=1)
+            own = int(np.argmin(np.linalg.norm(middle - corners.mean(axis=0), axis=1)))
+            x, y = geometry.visual.uv[face].mean(axis=0)
+            pixels = np.asarray(image.convert("RGB"))
+            seen = pixels[round((1 - y) * pixels.shape[0] - 0.5), round(x * pixels.shape[1] - 0.5)]
+            column, row = np.rint(atlas.uv[own].mean(axis=0)).astype(int)
+            assert np.abs(seen.astype(int) - atlas.pages[atlas.page[own]][row, column]).max() < 12
+            found += 1
+    assert found == 8
+
+
+def test_obj_is_the_same_twice_and_plain_on_request(room: Path) -> None:
+    mesh, atlas = square_room()
+    (room / "x").mkdir()
+    write_obj(room / "a.obj", mesh, atlas)
+    write_obj(room / "x" / "a.obj", mesh, atlas)
+    for name in ("a.obj", "a.mtl", "a_000.png"):
+        assert (room / name).read_bytes() == (room / "x" / name).read_bytes()
+    assert main(["export", str(room), "--format", "obj", "--no-textured", "--out", str(room / "p.obj")]) == 0
+    assert [path.name for path in room.glob("p*")] == ["p.obj"]
+    plain = trimesh.load(room / "p.obj", process=False, maintain_order=True)
+    np.testing.assert_allclose(plain.vertices, mesh.vertices, atol=1e-4)
+    np.testing.assert_array_equal(plain.faces, mesh.faces)
+    np.testing.assert_array_equal(plain.visual.vertex_colors[:, :3], mesh.colours)
+    assert main(["export", str(room), "--format", "obj", "--out", str(room / "a b.obj")]) == 2

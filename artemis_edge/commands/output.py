@@ -9,7 +9,7 @@ from typing import Any
 from artemis_edge.commands.common import DONE, command
 from artemis_edge.errors import InputError
 
-_FORMATS = ("ply", "glb")
+_FORMATS = ("ply", "glb", "obj", "laz", "colmap")  # formats.NAMES, without its imports
 
 
 def add_render(commands: Any) -> None:
