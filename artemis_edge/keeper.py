@@ -1,4 +1,5 @@
-"""What of the input stays beside the map: its points and images, for the baseline of ``evaluate texture`` and exports.
+"""What of the input stays beside the map: points and images, for the baseline of ``evaluate texture`` and exports,
+and keyframes, for questions asked later.
 
 Everything is written between frames, never inside one.
 """
@@ -12,11 +13,13 @@ from typing import Protocol
 import numpy as np
 
 from artemis_edge.colouring import colour_points
-from artemis_edge.config import KeepConfig
+from artemis_edge.config import KeepConfig, SegmentationConfig
 from artemis_edge.frames import F32, F64, LidarScan, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.kept_images import ImageSpool
 from artemis_edge.kept_points import PointSpool
 from artemis_edge.progress import Report, silent
+from artemis_edge.segmentation.keyframes import KeyframeStore
+from artemis_edge.trajectory import inverse
 
 Prepare = Callable[[SyncedFrame], SyncedFrame]
 
@@ -30,11 +33,17 @@ class Tracker(Protocol):
 class Keeper:
     """Keeps what the frames of a run brought, in ``folder`` until it is saved."""
 
-    def __init__(self, folder: Path, rules: KeepConfig) -> None:
+    def __init__(
+        self, folder: Path, rules: KeepConfig, segmentation: SegmentationConfig | None = None
+    ) -> None:
+        """Without ``segmentation`` no keyframes are kept."""
         self._points = PointSpool(folder / "points", rules.points)
         images = folder / "images"
         images.mkdir()
         self._images = ImageSpool(images, rules.images)
+        self._keyframes = (
+            None if segmentation is None else KeyframeStore.by(segmentation, folder / "keyframes")
+        )
         self._pending: tuple[SyncedFrame, Tracker] | None = None
 
     def between(self, prepare: Prepare, tracker: Tracker) -> Prepare:
@@ -58,15 +67,24 @@ class Keeper:
             return
         for image in frame.images:
             self._images.add(image)
+        self._offer_keyframes(tracked)
         for scan, moved in zip(frame.scans, tracked.scans, strict=True):
             time_s, intensity = _of_rows(scan, len(moved.points))
             points = _to_world(moved.points, tracked.T_world_lidar)
             self._points.add(points, scan.stamp_ns, time_s, intensity)
 
+    def _offer_keyframes(self, tracked: TrackedFrame) -> None:
+        """Images whose pose is known."""
+        if self._keyframes is not None and tracked.image_poses:
+            for image, T_world_lidar in zip(tracked.images, tracked.image_poses, strict=True):
+                self._keyframes.offer(image, T_world_lidar @ inverse(image.T_cam_lidar))
+
     def save(self, folder: Path, trajectory: Trajectory, report: Report = silent) -> int:
-        """Write points and images into a map's folder and colour the points; returns the size in bytes."""
+        """Write points, images and keyframes into a map's folder and colour the points; returns the size in bytes."""
         self.store()
         size = self._points.save(folder) + self._images.save(folder, trajectory)
+        if self._keyframes is not None and len(self._keyframes):
+            size += self._keyframes.save(folder)
         colour_points(folder, report)
         return size
 

@@ -98,7 +98,7 @@ def reprocess(
             mapper = make(request.config, tracker, pages)
             run = MappingRun(mapper, source, span, statistics)
             photos = HeldOut(request.out, request.holdout)
-            keeper = Keeper(pages, request.config.keep)
+            keeper = Keeper(pages, request.config.keep, request.config.segmentation)
             run.frames(report, interrupt, keeper.between(photos.take, mapper))
             if not statistics.frame_ms:
                 raise _nothing_mapped(run, source, span)

@@ -1,13 +1,14 @@
 """What of the input stays beside the map: points where they were measured, images with their poses."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from artemis_edge.config import Config, KeepConfig
+from artemis_edge.config import Config, KeepConfig, SegmentationConfig
 from artemis_edge.evaluate.photos import read_photos
 from artemis_edge.frames import (
     CameraImage,
@@ -22,6 +23,7 @@ from artemis_edge.keeper import Keeper
 from artemis_edge.kept_images import INDEX
 from artemis_edge.kept_points import FULL_INTENSITY, open_points
 from artemis_edge.runtime import Request, reprocess
+from artemis_edge.segmentation.keyframes import read_keyframes
 from tests.conftest import FakeMapper
 
 CAMERA = CameraModel(40, 30, 30.0, 30.0, 20.0, 15.0)
@@ -125,3 +127,26 @@ def test_a_frame_that_could_not_be_tracked_brings_nothing(tmp_path: Path) -> Non
     kept = open_points(tmp_path / "map")
     assert kept is not None and kept.rows == len(first.scans[0].points)
     assert len(list((tmp_path / "map" / "images").iterdir())) == 1
+
+
+class Posed(Forward):
+    """Knows the poses of the images too."""
+
+    def track(self, frame: SyncedFrame) -> TrackedFrame:
+        tracked = super().track(frame)
+        self.tracked = replace(tracked, image_poses=tuple(tracked.T_world_lidar for _ in frame.images))
+        return self.tracked
+
+
+def test_keyframes_are_kept_where_they_show_something_new(tmp_path: Path) -> None:
+    (tmp_path / "spool").mkdir()
+    keeper, tracker = Keeper(tmp_path / "spool", KeepConfig(), SegmentationConfig(keyframe_m=0.9)), Posed()
+    prepare = keeper.between(lambda frame: frame, tracker)
+    for frame in frames(5):
+        tracker.track(prepare(frame))
+    every = np.arange(5) * 10**8
+    keeper.save(tmp_path, Trajectory(every, np.tile(np.eye(4), (5, 1, 1))))
+    found = read_keyframes(tmp_path)
+    assert [item.stamp_ns // 10**8 for item in found] == [0, 2, 4]
+    np.testing.assert_allclose(found[1].T_world_cam[:3, 3], [1.0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(found[1].T_world_cam[:3, 2], [1.0, 0, 0], atol=1e-12)  # looks along x

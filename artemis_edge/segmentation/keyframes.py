@@ -7,6 +7,7 @@ was seen from elsewhere or towards elsewhere; where they grow beyond their budge
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from artemis_edge.config import SegmentationConfig
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F64, U8, CameraImage, CameraModel
@@ -27,7 +29,7 @@ INDEX = "index.json"
 #: What other parts of the program may have kept of a map's photographs, in the same form.
 _OTHER_INDEX = "images.json"
 _THINNING = 1.4  # the distance grows by this factor, the number falls to about half
-_DISTORTION = 5
+_MB = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,12 @@ class KeyframeStore:
     budget_bytes: int
     offered: int = 0
     _kept: list[_Kept] = field(default_factory=list)
+
+    @classmethod
+    def by(cls, config: SegmentationConfig, folder: Path) -> KeyframeStore:
+        """As configured."""
+        apart = Apart(config.keyframe_m, math.radians(config.keyframe_deg))
+        return cls(folder, apart, config.keyframes_mb * _MB)
 
     def __len__(self) -> int:
         return len(self._kept)
