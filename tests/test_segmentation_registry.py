@@ -222,6 +222,8 @@ def test_the_command(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     statuses = {answer["text"]: answer["status"] for answer in said["image"]["answers"]}
     assert statuses == {"car": "matched", "zorblax": "unsupported"}
     assert said["image"]["instances"][0]["text"] == "car"
+    assert main(["models", "archive", "colours", "--out", str(tmp_path / "a.tar.xz")]) == 0
+    assert (tmp_path / "a.tar.xz").stat().st_size > 100
     assert main(["models", "remove", "colours"]) == 0
     capsys.readouterr()
     assert main(["models", "list", "--json"]) == 0
@@ -241,6 +243,7 @@ def test_the_command(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         (["test", "gone"], "no model named 'gone'"),
         (["test", "--query", "car"], "--query needs a photograph"),
         (["test", "--query"], "expected one argument"),
+        (["archive", "attribute", "--out", "x.tar.xz"], "an OAK runs yolo-seg networks"),
     ],
 )
 def test_bad_use_is_one_sentence(

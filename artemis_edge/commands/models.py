@@ -33,6 +33,13 @@ def add(commands: Any) -> None:
     test.add_argument("--query", action="append", default=[], metavar="TEXT", help="what to look for in it")
     json_option(test)
 
+    archive = command(actions, "archive", run_archive, "pack a registered yolo-seg network for an OAK camera")
+    archive.add_argument("name", metavar="NAME")
+    archive.add_argument(
+        "--compiled", type=Path, metavar="FILE", help="compiled for the device (default: its ONNX file)"
+    )
+    archive.add_argument("--out", type=Path, required=True, metavar="FILE.tar.xz")
+
 
 def _add_parser(actions: Any) -> None:
     parser = command(actions, "add", run_add, "register an ONNX file after trying it")
@@ -125,6 +132,16 @@ def run_test(given: argparse.Namespace) -> int:
         print_json(result)
     else:
         print(_test_text(result))
+    return DONE
+
+
+def run_archive(given: argparse.Namespace) -> int:
+    """``artemis-edge models archive``."""
+    from artemis_edge.segmentation.oak import write_archive
+    from artemis_edge.segmentation.registry import Registry
+
+    entry = Registry().find(given.name)
+    write_archive(given.out, entry.manifest, given.compiled or entry.folder / entry.manifest.file)
     return DONE
 
 
