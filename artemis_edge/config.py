@@ -79,6 +79,18 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     gyro_sigma: Annotated[
         float, _float("Error of the gyroscope's rate, bias included, rad/s.", ge=1e-5, le=10.0)
     ] = 0.02
+    gyro_noise: Annotated[
+        float, _float("White noise of the gyroscope in the filter, rad/s/sqrt(Hz).", ge=1e-6, le=1.0)
+    ] = 1e-3
+    accel_noise: Annotated[
+        float, _float("White noise of the accelerometer in the filter, m/s2/sqrt(Hz).", ge=1e-5, le=10.0)
+    ] = 1e-2
+    gyro_walk: Annotated[
+        float, _float("Random walk of the gyroscope's bias, rad/s2/sqrt(Hz).", ge=1e-8, le=1.0)
+    ] = 2e-5
+    accel_walk: Annotated[
+        float, _float("Random walk of the accelerometer's bias, m/s3/sqrt(Hz).", ge=1e-8, le=10.0)
+    ] = 3e-4
 
 
 class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):

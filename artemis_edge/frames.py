@@ -74,11 +74,15 @@ class CameraImage:
 
 @dataclass(frozen=True, slots=True)
 class ImuSamples:
-    """Samples covering a frame: ``stamp_ns`` int64 (m,), ``gyro`` rad/s and ``accel`` m/s2 float64 (m, 3)."""
+    """Samples covering a frame: ``stamp_ns`` int64 (m,), ``gyro`` rad/s and ``accel`` m/s2 float64 (m, 3).
+
+    They are in the axes of the lidar frame; ``origin`` (3,) is where in that frame the IMU sits, m.
+    """
 
     stamp_ns: I64
     gyro: F64
     accel: F64
+    origin: F64 = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def empty(cls) -> ImuSamples:

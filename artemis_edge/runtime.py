@@ -22,8 +22,8 @@ from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import FrameSource, Odometry, SyncedFrame, Trajectory
 from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, readable, warm_up
+from artemis_edge.odometry.choice import OwnOdometry, odometry_for
 from artemis_edge.odometry.given_poses import GivenPoses
-from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.progress import Report, silent
 from artemis_edge.session.photos import INDEX, HeldOut
 from artemis_edge.session.report import Evaluation, RunStatistics, write_report
@@ -136,7 +136,7 @@ def choose_odometry(source: FrameSource, request: Request, span: range) -> Calla
     if source.poses is not None and len(source.poses) and not request.own_odometry:
         own = GivenPoses(source.poses)
         return lambda: own
-    return lambda: LidarOdometry.looking_ahead(request.config.odometry, _frames(source, span))
+    return lambda: odometry_for(request.config.odometry, lambda: _frames(source, span))
 
 
 def _frames(source: FrameSource, span: range) -> Iterator[SyncedFrame]:
@@ -181,7 +181,7 @@ def count_losses(statistics: RunStatistics, source: FrameSource, odometry: Odome
     """What the input could not give and what the stages could not use."""
     statistics.add_lost(source.lost)
     statistics.add_lost(mapper.lost)
-    if isinstance(odometry, LidarOdometry):
+    if isinstance(odometry, OwnOdometry):
         statistics.add_lost(
             {f"odometry_{reason.replace(' ', '_')}": n for reason, n in odometry.lost.items()}
         )

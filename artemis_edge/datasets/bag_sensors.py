@@ -115,7 +115,8 @@ def find_imu(index: BagIndex, config: InputConfig, lidar_frame: str) -> ImuSampl
     stamps = track.stamp_ns()
     order = np.argsort(stamps, kind="stable")
     stamps, values = stamps[order], np.array(track.values)[order]
-    R = _imu_rotation(index, topic, track.frame_id, lidar_frame)
+    T_lidar_imu = _imu_mounting(index, topic, track.frame_id, lidar_frame)
+    R = T_lidar_imu[:3, :3]
     gyro, accel = values[:, :3] @ R.T, values[:, 3:] @ R.T
     norm = float(np.median(np.linalg.norm(accel, axis=1)))
     if _IN_G[0] < norm < _IN_G[1]:
@@ -123,7 +124,7 @@ def find_imu(index: BagIndex, config: InputConfig, lidar_frame: str) -> ImuSampl
             f"the accelerations of {topic} are taken to be in g: their median is {norm:.2f}"
         )
         accel = accel * _GRAVITY
-    return ImuSamples(stamps, gyro, accel)
+    return ImuSamples(stamps, gyro, accel, T_lidar_imu[:3, 3])
 
 
 def find_odometry(index: BagIndex, config: InputConfig) -> OdometryTrack | None:
@@ -262,11 +263,12 @@ def _image(track: Track, k: int) -> bytes:
     return encoded_image(IMAGES[track.ros_type].read(reference.connection.reader(reference.data())))
 
 
-def _imu_rotation(index: BagIndex, topic: str, frame: str, lidar_frame: str) -> F64:
-    """Rotation (3, 3) of IMU axes to LiDAR axes; identity with a warning where tf does not say."""
+def _imu_mounting(index: BagIndex, topic: str, frame: str, lidar_frame: str) -> F64:
+    """T_lidar_imu (4, 4); identity with a warning where tf does not say."""
     T, known = _mounting(index, lidar_frame, frame, np.zeros(1, np.int64))
     if not known.all():
         index.warnings.append(
             f"tf does not say how the IMU {topic} is mounted; taken to have the LiDAR's axes"
         )
-    return T[0, :3, :3]
+    mounting: F64 = T[0]
+    return mounting

@@ -69,7 +69,7 @@ def split_imu(stamp_ns: I64, window_start_ns: I64) -> I64:
 
 def imu_between(imu: ImuSamples, first: int, last: int) -> ImuSamples:
     """Samples ``first:last``."""
-    return ImuSamples(imu.stamp_ns[first:last], imu.gyro[first:last], imu.accel[first:last])
+    return ImuSamples(imu.stamp_ns[first:last], imu.gyro[first:last], imu.accel[first:last], imu.origin)
 
 
 def median_interval_ns(stamp_ns: I64) -> float | None:

@@ -28,7 +28,7 @@ from artemis_edge.datasets.kitti_calibration import (
     odometry_cameras,
     odometry_T_cam_velo,
     raw_cameras,
-    raw_imu_rotation,
+    raw_imu_mounting,
 )
 from artemis_edge.datasets.kitti_files import (
     ImageFolder,
@@ -147,7 +147,7 @@ def open_raw(path: Path) -> KittiSource:
         stamp_ns,
         _turns(folder, scans, stamp_ns),
         pair_images(folders, scans, stamp_ns),
-        _read_oxts(path / "oxts", origin, raw_imu_rotation(day), scans),
+        _read_oxts(path / "oxts", origin, raw_imu_mounting(day), scans),
         lost=scans.lost,
         warnings=scans.warnings,
     )
@@ -171,7 +171,7 @@ def _image_times(folder: Path, origin: int) -> I64 | None:
     return read_datetimes(file) - origin if file.is_file() else None
 
 
-def _read_oxts(folder: Path, origin: int, R_velo_imu: F64, scans: ScanFiles) -> ImuSamples:
+def _read_oxts(folder: Path, origin: int, T_velo_imu: F64, scans: ScanFiles) -> ImuSamples:
     """IMU samples in the Velodyne's axes, ordered by time; rows that are broken are counted."""
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
@@ -189,8 +189,9 @@ def _read_oxts(folder: Path, origin: int, R_velo_imu: F64, scans: ScanFiles) -> 
         scans.warnings.append(f"{broken} IMU rows in {folder} are broken and left out")
     order = np.argsort(stamps, kind="stable")
     rows = np.array(values).reshape(-1, _OXTS_COLUMNS)[order]
-    gyro, accel = rows[:, _OXTS_GYRO] @ R_velo_imu.T, rows[:, _OXTS_ACCEL] @ R_velo_imu.T
-    return ImuSamples(np.array(stamps, np.int64)[order], gyro, accel)
+    R = T_velo_imu[:3, :3]
+    gyro, accel = rows[:, _OXTS_GYRO] @ R.T, rows[:, _OXTS_ACCEL] @ R.T
+    return ImuSamples(np.array(stamps, np.int64)[order], gyro, accel, T_velo_imu[:3, 3])
 
 
 def _oxts_row(file: Path) -> F64 | None:

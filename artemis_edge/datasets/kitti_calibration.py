@@ -97,12 +97,12 @@ def odometry_T_cam_velo(sequence: Path) -> F64 | None:
     return T
 
 
-def raw_imu_rotation(day: Path) -> F64:
-    """Rotation (3, 3) of IMU axes to Velodyne axes; identity (KITTI mounts them alike) without the file."""
+def raw_imu_mounting(day: Path) -> F64:
+    """T_velo_imu (4, 4); identity (KITTI has their axes alike) without the file."""
     path = day / "calib_imu_to_velo.txt"
     if not path.is_file():
-        return np.eye(3)
-    return _rigid(read_calibration(path), path)[:3, :3]
+        return np.eye(4)
+    return _rigid(read_calibration(path), path)
 
 
 def _rigid(rows: dict[str, F64], path: Path) -> F64:

@@ -49,6 +49,7 @@ def join(before: ImuSamples, after: ImuSamples) -> ImuSamples:
         np.concatenate([before.stamp_ns, after.stamp_ns[new]]),
         np.concatenate([before.gyro, after.gyro[new]]),
         np.concatenate([before.accel, after.accel[new]]),
+        after.origin if len(after.stamp_ns) else before.origin,
     )
 
 
@@ -66,4 +67,4 @@ def rate_during(imu: ImuSamples, middle_ns: int) -> F64 | None:
 def since(imu: ImuSamples, stamp_ns: int) -> ImuSamples:
     """The samples after a time."""
     keep = imu.stamp_ns > stamp_ns
-    return ImuSamples(imu.stamp_ns[keep], imu.gyro[keep], imu.accel[keep])
+    return ImuSamples(imu.stamp_ns[keep], imu.gyro[keep], imu.accel[keep], imu.origin)

@@ -1,7 +1,4 @@
-"""LiDAR odometry: scan to map with constant velocity as the prior (section III-A without the filter).
-
-The filter (IMU, images) of a later version takes this place and keeps ``Odometry.track``.
-"""
+"""LiDAR odometry without an IMU (or with a slow one): scan to map with constant velocity as the prior."""
 
 from __future__ import annotations
 
@@ -18,8 +15,8 @@ from artemis_edge.odometry import imu as inertial
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.aligner import Aligner
 from artemis_edge.odometry.deskew import deskew_frame, window
+from artemis_edge.odometry.local_map import LocalMap
 from artemis_edge.odometry.motion import Motion, Prediction
-from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import DEGENERATE, Registration
 from artemis_edge.odometry.scan_motion import ScanMotion, times, turning_or_steady
 from artemis_edge.odometry.thin import Thinner, ThinScan, TimedPoints
@@ -27,8 +24,6 @@ from artemis_edge.odometry.thin import Thinner, ThinScan, TimedPoints
 _START_FRAMES = 2  # what it takes to know a velocity
 _START_ROUNDS = 2  # the first scan is corrected with the motion found and the second registered again
 _GIVE_UP = 10  # frames lost in a row after which the map is begun anew at the predicted pose
-_EVICT_TRAVEL = 0.25  # share of the range travelled after which far voxels are looked for
-_FULL = 0.8  # share of the voxels in use from which room is made
 
 
 class _First(NamedTuple):
@@ -56,13 +51,12 @@ class LidarOdometry:
         self.lost: dict[str, int] = {}
         self._config = config
         self._thinner = Thinner(config)
-        self._map = PlaneMap(config.voxel_m, config.levels, config.max_voxels)
-        self._aligner = Aligner(config, self._map)
+        self._map = LocalMap(config)
+        self._aligner = Aligner(config, self._map.planes)
         self._motion: Motion | None = None
         self._first: _First | None = None  # until its motion is known
         self._imu = ImuSamples.empty()
         self._lost_in_a_row = 0
-        self._evicted_at = np.zeros(3)
         self._start_twist: F64 = np.zeros(6) if start_twist is None else start_twist
 
     @classmethod
@@ -116,9 +110,7 @@ class LidarOdometry:
             twist[3:] = rate
         self._first = _First(T_world_lidar, (scan.stamp_ns - stamp_ns) * 1e-9, scan.dense)
         self._motion = Motion(self._first.at_middle(twist), scan.stamp_ns, twist)
-        self._map.clear()
-        self._map.insert(scan.dense.at_one_time(twist), self._motion.T_world_lidar)
-        self._evicted_at = T_world_lidar[:3, 3]
+        self._map.begin(scan.dense.at_one_time(twist), self._motion.T_world_lidar)
 
     def _correct_first(
         self, first: _First, scan: ThinScan, prediction: Prediction, found: Registration
@@ -132,8 +124,7 @@ class LidarOdometry:
             twist = prediction.twist(refined.T_world_lidar)
             T_old_new = se3.inverse(prediction.T_world_start) @ refined.T_world_lidar
             prediction = prediction.rebased(first.at_middle(twist))
-            self._map.clear()
-            self._map.insert(first.dense.at_one_time(twist), prediction.T_world_start)
+            self._map.begin(first.dense.at_one_time(twist), prediction.T_world_start)
             refined = self._aligner.refine(scan.sparse, prediction, prediction.T_world_start @ T_old_new)
         return prediction, refined
 
@@ -141,16 +132,8 @@ class LidarOdometry:
         self._motion = Motion(se3.orthonormal(T_world_lidar), scan.stamp_ns, twist, known=True)
         self._first, self._lost_in_a_row = None, 0
         self._imu = inertial.since(self._imu, scan.stamp_ns)
-        self._make_room(T_world_lidar[:3, 3])
-        if refused := self._map.insert(scan.dense.at_one_time(twist), T_world_lidar):
+        if refused := self._map.add(scan.dense.at_one_time(twist), T_world_lidar):
             self._count("points without room in the local map", refused)
-
-    def _make_room(self, place: F64) -> None:
-        travelled = float(np.linalg.norm(place - self._evicted_at))
-        far = travelled > _EVICT_TRAVEL * self._config.max_range_m
-        if far or len(self._map) > _FULL * self._config.max_voxels:
-            self._map.evict(place, self._config.max_range_m)
-            self._evicted_at = place
 
     def _fall_back(self, frame: SyncedFrame, scan: ThinScan) -> TrackedFrame:
         """The frame could not be registered: the predicted pose, and after many in a row a new map there."""

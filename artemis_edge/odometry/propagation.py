@@ -64,7 +64,16 @@ def propagate(
         np.array(noise), T, velocity, rate, acceleration, P,
     )  # fmt: skip
     end = replace(state, stamp_ns=stamp_ns, T_world_body=se3.orthonormal(T[-1]), velocity=velocity[-1], P=P)
-    path = Path(nodes.time_s[:-1] - span_s, T[:-1], velocity[:-1], rate, acceleration, end, origin)
+    path = Path(
+        nodes.time_s[:-1] - span_s,
+        T[:-1],
+        velocity[:-1],
+        rate,
+        acceleration,
+        end,
+        origin,
+        bool(nodes.hole.all()),
+    )
     return end, path
 
 
@@ -75,14 +84,15 @@ def _nodes(state: State, stamp_ns: int, imu: ImuSamples, turn_rate: F64) -> _Nod
     span_s = (stamp_ns - state.stamp_ns) * 1e-9
     inside = (sample_s > 0.0) & (sample_s < span_s)
     time_s: F64 = np.concatenate([[0.0], sample_s[inside], [span_s]], dtype=np.float64)
-    if len(sample_s) == 0:
-        held = turn_rate + state.gyro_bias
+    held = turn_rate + state.gyro_bias
+    if not inside.any() and (len(sample_s) < 2 or sample_s[-1] - sample_s[0] > HOLE_S):
         return _Nodes(time_s, np.tile(held, (2, 1)), np.zeros((2, 3)), np.ones(1, np.bool_))
     gyro = np.column_stack([np.interp(time_s, sample_s, near.gyro[:, k]) for k in range(3)])
     accel = np.column_stack([np.interp(time_s, sample_s, near.accel[:, k]) for k in range(3)])
-    if sample_s[0] > 0.0 and sample_s[0] > HOLE_S:
-        gyro[0] = turn_rate + state.gyro_bias
-    return _Nodes(time_s, gyro, accel, _holes(time_s, sample_s))
+    hole = _holes(time_s, sample_s)
+    if hole[0]:
+        gyro[0] = held
+    return _Nodes(time_s, gyro, accel, hole)
 
 
 def _holes(time_s: F64, sample_s: F64) -> Bool:
@@ -153,8 +163,9 @@ def _carry(P: F64, R: F64, turn: F64, force: F64, dt: float, hole: bool, noise: 
         cross = F @ np.ascontiguousarray(P[:CAMERAS, CAMERAS:])
         P[:CAMERAS, CAMERAS:] = cross
         P[CAMERAS:, :CAMERAS] = cross.T
-    # white noise gives density^2 dt; in a hole the unknown acceleration lasts as long as the piece
-    turned = (0.5 * noise[4] * dt * dt) ** 2 if hole else noise[0] ** 2 * dt
+    # white noise gives density^2 dt; in a hole the unknown acceleration lasts as long as the piece, and the rate
+    # that is held is that of a middle as long ago
+    turned = (noise[4] * dt * dt) ** 2 if hole else noise[0] ** 2 * dt
     pushed = (noise[5] * dt) ** 2 if hole else noise[1] ** 2 * dt
     for k in range(3):
         P[3 + k, 3 + k] += turned

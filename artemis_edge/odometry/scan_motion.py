@@ -116,7 +116,7 @@ def during(imu: ImuSamples, first_ns: int, last_ns: int) -> ImuSamples:
     """The samples within a time, and one on either side so that the ends can be interpolated."""
     low = max(int(np.searchsorted(imu.stamp_ns, first_ns, "right")) - 1, 0)
     high = int(np.searchsorted(imu.stamp_ns, last_ns, "left")) + 1
-    return ImuSamples(imu.stamp_ns[low:high], imu.gyro[low:high], imu.accel[low:high])
+    return ImuSamples(imu.stamp_ns[low:high], imu.gyro[low:high], imu.accel[low:high], imu.origin)
 
 
 def covers(imu: ImuSamples, first_ns: int, last_ns: int, slack_ns: int = 20_000_000) -> bool:
