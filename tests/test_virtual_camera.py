@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from artemis_drivers.virtual import street
+from artemis_drivers.virtual import sensor, street
 from artemis_drivers.virtual.camera import CameraSpec, VirtualCamera, distort, undistort
 from artemis_drivers.virtual.mesh_builder import F64, MeshBuilder
 from artemis_drivers.virtual.motion import Motion
@@ -326,6 +326,19 @@ def test_true_view_names_what_it_shows(atlas: TextureAtlas) -> None:
     np.testing.assert_allclose(true.colour, expected, atol=0.51)
 
 
+def test_what_was_seen_is_what_rays_through_the_pixels_meet(town: tuple[World, Scene]) -> None:
+    world, scene = town
+    camera = VirtualCamera(CameraSpec().scaled(96), 0)
+    T = looking(20.0, -1.5, 1.5, 0.2)
+    true = truth_images(scene, world.sun, T, camera, 0.0)
+    triangles, depth = camera.seen()
+    assert triangles.shape == (*depth.shape, 4)
+    label = np.where(triangles >= 0, scene.class_id[triangles], 0)
+    whole = (label == label[:, :, :1]).all(axis=2)
+    assert (label[whole, 0] == true.label[whole]).mean() > 0.99
+    assert (np.isinf(depth) == (triangles < 0).all(axis=2)).all()
+
+
 # --- motion blur
 
 
@@ -378,6 +391,48 @@ def test_motion_blur_is_the_mean_over_the_exposure(atlas: TextureAtlas, case: st
 
     # at the silhouette of a mover the filter blurs only what lies inside it
     assert rms(expected) < (0.8 if case == "mover" else 0.35) * rms(sharp)
+
+
+def naive_trail(light: F64, i: int, j: int, colour: int, du: float, dv: float) -> float:
+    """Mean over many points of the path, interpolated across it and by hats of one pixel along it."""
+    longer = max(abs(du), abs(dv))
+    if longer <= 0.3:
+        return float(light[i, j, colour])
+    height, width = light.shape[:2]
+    at = (np.arange(4000) + 0.5) / 4000 - 0.5
+    x, y = j + at * du, i + at * dv
+    # along its longer axis the path is read between whole rows or columns at the points where it crosses them
+    major, slope = (x, dv / du) if abs(du) >= abs(dv) else (y, du / dv)
+    origin = (j, i) if abs(du) >= abs(dv) else (i, j)
+
+    def crossing(n: F64) -> F64:
+        minor = origin[1] + (n - origin[0]) * slope
+        rows, columns = (minor, n) if abs(du) >= abs(dv) else (n, minor)
+        rows, columns = np.clip(rows, 0, height - 1.001), np.clip(columns, 0, width - 1.001)
+        rows, columns = (rows, np.rint(columns)) if abs(du) >= abs(dv) else (np.rint(rows), columns)
+        r, c = np.floor(rows).astype(int), np.floor(columns).astype(int)
+        r1, c1 = np.minimum(r + 1, height - 1), np.minimum(c + 1, width - 1)
+        fr, fc = rows - r, columns - c
+        upper = light[r, c, colour] * (1 - fc) + light[r, c1, colour] * fc
+        lower = light[r1, c, colour] * (1 - fc) + light[r1, c1, colour] * fc
+        return np.asarray(upper * (1 - fr) + lower * fr)
+
+    before = np.floor(major)
+    share = major - before
+    return float(np.mean(crossing(before) * (1 - share) + crossing(before + 1) * share))
+
+
+def test_trails_are_the_mean_along_the_path() -> None:
+    rng = np.random.default_rng(5)
+    light = rng.uniform(0, 1, (24, 30, 3)).astype(np.float32)
+    lengths = [0.0, 0.2, 0.4, 1.0, 1.9, 2.0, 2.1, 3.7, 6.0, 9.3]
+    places = [(12, 15), (8, 20), (1, 1), (0, 7), (23, 29), (22, 3)]
+    for length in lengths:
+        for angle in (0.0, 0.4, np.pi / 4, 1.3, np.pi / 2, 2.5, 4.0, 5.9):
+            du, dv = length * np.cos(angle), length * np.sin(angle)
+            for i, j in places:
+                expected = naive_trail(light, i, j, 1, du, dv)
+                assert sensor._trail(light, i, j, 1, du, dv) == pytest.approx(expected, abs=2e-3)
 
 
 def naive_expose(film: Film, lines: F64, moved: F64, lens: Optics, raw_scale: F64) -> F64:

@@ -126,13 +126,14 @@ def amplifier(spec: SensorSpec, used: Exposure) -> Amplifier:
 
 
 @kernel(forceinline=True)
-def _flow(D: F64, lens: Optics, x: float, y: float, inverse_depth: float) -> tuple[Any, Any]:
-    """Pixels by which what is seen on the line of sight (x, y, 1) moves when its point p moves by D (p, 1):
-    the derivatives of the perspective and of the lens.
+def _flow(moved: F64, part: int, lens: Optics, x: float, y: float, inverse_depth: float) -> tuple[Any, Any]:
+    """Pixels by which what is seen on the line of sight (x, y, 1) moves when its point p moves by D (p, 1): the
+    derivatives of the perspective and of the lens. D is ``moved[part]``.
     """
-    c = D[2, 0] * x + D[2, 1] * y + D[2, 2] + D[2, 3] * inverse_depth
-    dx = D[0, 0] * x + D[0, 1] * y + D[0, 2] + D[0, 3] * inverse_depth - x * c
-    dy = D[1, 0] * x + D[1, 1] * y + D[1, 2] + D[1, 3] * inverse_depth - y * c
+    k = part
+    c = moved[k, 2, 0] * x + moved[k, 2, 1] * y + moved[k, 2, 2] + moved[k, 2, 3] * inverse_depth
+    dx = moved[k, 0, 0] * x + moved[k, 0, 1] * y + moved[k, 0, 2] + moved[k, 0, 3] * inverse_depth - x * c
+    dy = moved[k, 1, 0] * x + moved[k, 1, 1] * y + moved[k, 1, 2] + moved[k, 1, 3] * inverse_depth - y * c
     k1, k2, p1, p2, k3 = lens.k
     r2, dr2 = x * x + y * y, 2 * (x * dx + y * dy)
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -179,6 +180,42 @@ def _trail(light: F32, i: int, j: int, colour: int, du: float, dv: float) -> Any
         return light[i, j, colour]
     slope = dv / du if across else du / dv
     half = 0.5 * min(length, _LONGEST_TRAIL)
+    height, width = light.shape[:2]
+    whole = int(half)  # steps to either side that are nearer than this count fully
+    reach, aside = whole + 2, int((whole + 1) * abs(slope)) + 2
+    rows, columns = (aside, reach) if across else (reach, aside)
+    if not (rows <= i < height - rows and columns <= j < width - columns):
+        return _trail_at_border(light, i, j, colour, half, slope, across)
+    if half <= 1.0:
+        return _short_trail(light, i, j, colour, half, slope, across)
+    total = 0.0
+    for m in range(-whole + 1, whole):
+        total += _step(light, i, j, colour, m, slope, across, aside)
+    rest = half - whole
+    last = _step(light, i, j, colour, whole, slope, across, aside)
+    last += _step(light, i, j, colour, -whole, slope, across, aside)
+    beyond = _step(light, i, j, colour, whole + 1, slope, across, aside)
+    beyond += _step(light, i, j, colour, -whole - 1, slope, across, aside)
+    return (total + _under_hat(rest) * last + _under_hat(rest - 1.0) * beyond) / (2.0 * half)
+
+
+@kernel(forceinline=True)
+def _step(light: F32, i: int, j: int, colour: int, m: int, slope: float, across: bool, aside: int) -> Any:
+    """Light ``m`` whole steps along a trail; it leaves its row or column by less than ``aside``."""
+    minor = aside + m * slope  # not negative, so that cutting off decimals rounds down
+    n = int(minor)
+    if across:
+        row, column = i - aside + n, j + m
+        near, far = light[row, column, colour], light[row + 1, column, colour]
+    else:
+        row, column = i + m, j - aside + n
+        near, far = light[row, column, colour], light[row, column + 1, colour]
+    return near + (minor - n) * (far - near)
+
+
+@kernel(forceinline=True)
+def _trail_at_border(light: F32, i: int, j: int, colour: int, half: float, slope: float, across: bool) -> Any:
+    """:func:`_trail` of ``half`` pixels to either side, where it may leave the picture."""
     reach = int(half + 1.0)
     total = 0.0
     for m in range(-reach, reach + 1):
@@ -186,6 +223,20 @@ def _trail(light: F32, i: int, j: int, colour: int, du: float, dv: float) -> Any
         major, minor = (j + m, i + m * slope) if across else (i + m, j + m * slope)
         total += weight * _between_pixels(light, major, minor, across, colour)
     return total / (2.0 * half)
+
+
+@kernel(forceinline=True)
+def _short_trail(light: F32, i: int, j: int, colour: int, half: float, slope: float, across: bool) -> Any:
+    """:func:`_trail` where it reaches the next row or column only, ``half`` <= 1, and not at the border."""
+    aside, share = 1 if slope >= 0.0 else -1, abs(slope)
+    if across:
+        a, b = light[i, j + 1, colour], light[i, j - 1, colour]
+        c, d = light[i + aside, j + 1, colour], light[i - aside, j - 1, colour]
+    else:
+        a, b = light[i + 1, j, colour], light[i - 1, j, colour]
+        c, d = light[i + 1, j + aside, colour], light[i - 1, j - aside, colour]
+    ends = a + b + share * (c + d - a - b)
+    return (1.0 - 0.5 * half) * light[i, j, colour] + 0.25 * half * ends
 
 
 @njit
@@ -214,7 +265,7 @@ def expose(
             n, colour = i * width + j, (i & 1) + (j & 1)
             x, y, part = lines[i, j, 0], lines[i, j, 1], film.part[n]
             inverse_depth = 1.0 / film.depth[n]
-            du, dv = _flow(moved[part], lens, x, y, inverse_depth)
+            du, dv = _flow(moved, part, lens, x, y, inverse_depth)
             value = _trail(light, i, j, colour, du, dv)
             e = max(value, 0.0) * falloff[i, j] * efficiency[colour] * amplifier.electrons
             e += noise[i, j] * amplifier.noise * np.sqrt(e + amplifier.read_noise * amplifier.read_noise)
