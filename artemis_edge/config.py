@@ -369,6 +369,14 @@ def to_toml(config: Config) -> str:
     return tomli_w.dumps(msgspec.to_builtins(config))
 
 
+def from_toml(text: str) -> Config:
+    """Inverse of ``to_toml``; InputError for a text that is none."""
+    try:
+        return msgspec.toml.decode(text, type=Config)
+    except (msgspec.MsgspecError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"configuration: {error}; docs/tuning.md lists every field and its range") from None
+
+
 def profiles() -> list[str]:
     """Names of the profiles that ship with the program."""
     folder = resources.files("artemis_edge") / "profiles"

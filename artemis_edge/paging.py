@@ -427,6 +427,16 @@ class PageFile:
         del self._place[key]
         return page
 
+    def flush(self) -> None:
+        """Have everything in the file: another process is about to use it, too."""
+        if self._file is not None:
+            self._file.flush()
+
+    def reopen(self) -> None:
+        """In a copy of the process: its own place in the file. Pages that the other appended mean nothing here."""
+        if self._file is not None:
+            self._file = self._path.open("r+b")
+
     def close(self) -> None:
         """Close and remove the file: the map is saved elsewhere."""
         if self._file is not None:

@@ -105,7 +105,9 @@ def reprocess(
             run.flush()
         count_losses(statistics, source, tracker, mapper)
         results = Results(request.out)
-        outcome = _write(results, run, mapper, keeper, photos, statistics, evaluate)
+        outcome = write_results(
+            results, run.trajectory(), mapper, keeper, photos, statistics, evaluate
+        )
     _complain(run, results, request.out)
     if outcome is not None and not outcome["triangles"]:
         raise _nothing_meshed(outcome, request, results)
@@ -188,9 +190,9 @@ def count_losses(statistics: RunStatistics, source: FrameSource, odometry: Odome
     statistics.frames_dropped += source.lost.get("empty_file", 0)
 
 
-def _write(
+def write_results(
     results: Results,
-    run: MappingRun,
+    trajectory: Trajectory,
     mapper: Mapper,
     keeper: Keeper,
     photos: HeldOut,
@@ -198,7 +200,6 @@ def _write(
     evaluate: Evaluate | None,
 ) -> dict[str, Any] | None:
     """All results, small ones first; returns the report."""
-    trajectory = run.trajectory()
     results.attempt("trajectory.tum", lambda path: _write_tum(path, trajectory))
     results.text("config.toml", statistics.config_toml)
     results.json("objects.json", {"objects": []})

@@ -113,7 +113,7 @@ class SessionFiles:
         if self._writer is None:
             self._open(sent.log_ns)
         assert self._writer is not None
-        if sent.topic in topics.LATCHED:
+        if sent.topic in topics.LATCHED or sent.ros_type == topics.CAMERA_INFO.ros_type:
             self._latched[sent.topic, sent.data] = sent
         self._put(self._writer, sent)
         self.messages[sent.topic] += 1

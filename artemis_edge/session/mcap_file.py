@@ -17,10 +17,11 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 
 from artemis_edge.errors import InputError
+from artemis_edge.session.message_ring import Sent
 
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
@@ -130,3 +131,23 @@ def _broken_up(chunk: Chunk) -> list[Content]:
         )
     records: list[Any] = breakup_chunk(chunk, validate_crc=True)
     return records
+
+
+@dataclass(slots=True)
+class GrowingFile:
+    """A file that our recorder is writing: its messages with the numbers that the recorder gave them."""
+
+    path: Path
+
+    def messages(self) -> Iterator[Sent]:
+        """Those of all whole chunks, in order."""
+        types: dict[int, str] = {}
+        channels: dict[int, tuple[str, str]] = {}
+        for _, record in McapFile(self.path).records():
+            if isinstance(record, Schema):
+                types[record.id] = record.name
+            elif isinstance(record, Channel):
+                channels[record.id] = record.topic, types.get(record.schema_id, "")
+            elif isinstance(record, Message):
+                topic, ros_type = channels[record.channel_id]
+                yield Sent(record.sequence, topic, ros_type, record.log_time, record.publish_time, record.data)

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mcap.records import Channel, Message
+from mcap.records import Attachment, Channel, Message
 
+from artemis_edge.config import Config, from_toml
 from artemis_edge.datasets.rosbag import bag_files
 from artemis_edge.errors import InputError
 from artemis_edge.session.mcap_file import McapFile
 
+CONFIG_NAME = "mapping.toml"  # the attachment that holds the settings of the mapping
 _SECOND_NS = 1_000_000_000
 
 
@@ -90,3 +92,15 @@ def sessions_in(folder: Path) -> list[Path]:
     found = [place for place in folder.iterdir() if place.is_dir() and any(place.glob("*.mcap"))]
     found += [file for file in folder.glob("*.mcap") if file.is_file()]
     return sorted(found, key=lambda place: (place.stat().st_mtime_ns, place.name))
+
+
+def session_config(path: Path) -> Config:
+    """The mapping settings that were attached to a recording when it began, the defaults if there are none."""
+    files = [file for file in bag_files(path) if file.suffix == ".mcap"]
+    for file in files[:1]:
+        for _, record in McapFile(file).records():
+            if isinstance(record, Attachment) and record.name == CONFIG_NAME:
+                return from_toml(bytes(record.data).decode())
+            if isinstance(record, Message):
+                break
+    return Config()

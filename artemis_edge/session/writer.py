@@ -112,14 +112,10 @@ class SessionWriter:
 
         What is None is written as zero. ``tag`` and ``line`` are the bytes of the Livox protocol.
         """
-        cloud = np.zeros(len(points), POINT)
-        for axis, name in enumerate("xyz"):
-            cloud[name] = points[:, axis]
-        columns = {"intensity": intensity, "tag": tag, "line": line, "t": offset_ns}
-        for name, values in columns.items():
-            if values is not None:
-                cloud[name] = values
-        self.write_cloud(stamp_ns, cloud, receive_ns=receive_ns, frame_id=frame_id, topic=topic)
+        message = cloud_message(
+            stamp_ns, points, intensity, tag=tag, line=line, offset_ns=offset_ns, frame_id=frame_id
+        )
+        self.write(topic, message, stamp_ns, receive_ns)
 
     def write_cloud(
         self,
@@ -131,13 +127,7 @@ class SessionWriter:
         topic: str = topics.LIDAR_POINTS.name,
     ) -> None:
         """Rows of a structured array (n,), packed, as a PointCloud2 with the same fields."""
-        fields = tuple(
-            PointField(name, offset, FIELD_TYPES[dtype.str[1:]])
-            for name, (dtype, offset, *_) in (cloud.dtype.fields or {}).items()
-        )
-        step, header = cloud.dtype.itemsize, Header(stamp_ns, frame_id)
-        message = PointCloud2(header, 1, len(cloud), fields, step, cloud.nbytes, cloud.tobytes())
-        self.write(topic, message, stamp_ns, receive_ns)
+        self.write(topic, structured_cloud(stamp_ns, cloud, frame_id), stamp_ns, receive_ns)
 
     def write_imu(
         self,
@@ -357,6 +347,37 @@ class SessionWriter:
         return RunError(
             f"cannot write the session {self.path}: {error.strerror}; free space or choose another disk"
         )
+
+
+def cloud_message(
+    stamp_ns: int,
+    points: F32,
+    intensity: F32 | None = None,
+    *,
+    tag: U8 | None = None,
+    line: U8 | None = None,
+    offset_ns: np.ndarray[Any, Any] | None = None,
+    frame_id: str = "lidar",
+) -> PointCloud2:
+    """A LiDAR window as ``SessionWriter.write_points`` takes it."""
+    cloud = np.zeros(len(points), POINT)
+    for axis, name in enumerate("xyz"):
+        cloud[name] = points[:, axis]
+    columns = {"intensity": intensity, "tag": tag, "line": line, "t": offset_ns}
+    for name, values in columns.items():
+        if values is not None:
+            cloud[name] = values
+    return structured_cloud(stamp_ns, cloud, frame_id)
+
+
+def structured_cloud(stamp_ns: int, cloud: np.ndarray[Any, Any], frame_id: str) -> PointCloud2:
+    """Rows of a structured array (n,), packed, with the same fields."""
+    fields = tuple(
+        PointField(name, offset, FIELD_TYPES[dtype.str[1:]])
+        for name, (dtype, offset, *_) in (cloud.dtype.fields or {}).items()
+    )
+    step, header = cloud.dtype.itemsize, Header(stamp_ns, frame_id)
+    return PointCloud2(header, 1, len(cloud), fields, step, cloud.nbytes, cloud.tobytes())
 
 
 def _transform(stamp_ns: int, parent: str, child: str, T: F64) -> TransformStamped:

@@ -1,1 +1,1 @@
-"""Cameras of the rig."""
+"""Cameras: hardware-triggered OAK cameras by depthai, folders and videos for the bench, frames in shared memory."""

@@ -36,13 +36,33 @@ class OakSettings(Struct, frozen=True, forbid_unknown_fields=True, tag="oak", ta
 
 
 class FilesSettings(Struct, frozen=True, forbid_unknown_fields=True, tag="files", tag_field="kind"):
-    """Images of a folder (in order of name) or frames of a video, one a trigger: for work on the bench."""
+    """Images of a folder (in order of name) or frames of a video, at a steady rate: for work on the bench."""
 
     path: str
     name: str = "cam_0"
+    rate_hz: Annotated[float, Meta(ge=0.1, le=120.0)] = 10.0
     exposure_us: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
     repeat: Annotated[bool, Meta(description="Begin again after the last.")] = True
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 92
 
 
-CameraSettings = OakSettings | FilesSettings
+class SharedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag="shared", tag_field="kind"):
+    """A camera of another process of this computer, such as the virtual one: a ring in a file of shared memory."""
+
+    path: str
+    name: str = "cam_0"
+    most_bytes: Annotated[
+        int, Meta(description="Of one photograph; the same on both sides.", ge=1024, le=100_000_000)
+    ] = 2_000_000
+
+
+CameraSettings = OakSettings | FilesSettings | SharedSettings
+
+_MOST_FILE_BYTES = 8_000_000
+
+
+def most_bytes(settings: CameraSettings) -> int:
+    """How large a photograph of this camera can be."""
+    if isinstance(settings, OakSettings):
+        return settings.width * settings.height * 3
+    return _MOST_FILE_BYTES if isinstance(settings, FilesSettings) else settings.most_bytes

@@ -1,0 +1,140 @@
+"""The mapping of a stream of messages: the same for what is recorded just now and for what is replayed."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from artemis_edge import topics
+from artemis_edge.config import Config, to_toml
+from artemis_edge.errors import InputError
+from artemis_edge.frames import SyncedFrame, Trajectory
+from artemis_edge.mapping_run import Mapper
+from artemis_edge.odometry.lidar_odometry import LidarOdometry
+from artemis_edge.runtime import MakeMapper, pipeline, write_results
+from artemis_edge.session.assembly import FrameAssembler
+from artemis_edge.session.message_ring import Sent
+from artemis_edge.session.messages import CameraInfo, CompressedImage, Header, Imu, Message, Text, TFMessage
+from artemis_edge.session.messages import TransformStamped
+from artemis_edge.session.photos import HeldOut
+from artemis_edge.session.results import Results, prepare
+from artemis_edge.session.statistics import RunStatistics
+from artemis_edge.session.writer import cloud_message
+
+_NS_PER_MS = 1e6
+_WARM_UP_MB = 600
+_WARM_UP_FRAMES = 4
+_FRAME_NS = 100_000_000
+_INPUT_HZ = 10.0
+
+
+class StreamMapping:
+    """Takes messages in their order; every frame that one completes is mapped.
+
+    ``skip`` are indices of frames that are not mapped, because mapping them ended the process.
+    """
+
+    def __init__(self, config: Config, pages: Path, make: MakeMapper = pipeline, name: str = "live") -> None:
+        self.config = config
+        self.assembler = FrameAssembler()
+        self.odometry = LidarOdometry(config.odometry)
+        self.mapper: Mapper = make(config, self.odometry, pages)
+        self.statistics = RunStatistics(name, _INPUT_HZ, config_toml=to_toml(config))
+        self.skip: set[int] = set()
+        self.latest_ns = 0
+        self.fault = ""
+        self.before: Callable[[int], None] = lambda index: None
+
+    def take(self, sent: Sent) -> bool:
+        """Whether the message completed a frame. A frame that cannot be mapped is counted and skipped."""
+        frame = self.assembler.take(sent)
+        if frame is None:
+            return False
+        self.before(frame.index)
+        self.latest_ns = frame.stamp_ns
+        if frame.index in self.skip:
+            self._drop("frames_that_end_the_process")
+            return True
+        try:
+            self._map(frame)
+        except InputError as error:
+            self.fault = self.fault or str(error)
+            self._drop("frames_skipped")
+        return True
+
+    def save(self, out: Path) -> dict[str, Any]:
+        """Finish the map and write all results to ``out``; returns what report.json holds. Raises RunError."""
+        prepare(out)
+        wall, cpu = time.perf_counter_ns(), time.process_time_ns()
+        self.mapper.finish()
+        self.statistics.flush_ms = (time.perf_counter_ns() - wall) / _NS_PER_MS
+        self.statistics.flush_cpu_ms = (time.process_time_ns() - cpu) / _NS_PER_MS
+        self.statistics.add_lost(self.assembler.lost)
+        self.statistics.add_lost(self.mapper.lost)
+        results = Results(out)
+        report = write_results(
+            results, self.trajectory(), self.mapper, HeldOut(out, 0), self.statistics, None
+        )
+        return {"report": report or {}, "kept": results.kept, "fault": results.fault or ""}
+
+    def trajectory(self) -> Trajectory:
+        """The pose of every frame that was mapped."""
+        poses = self.mapper.trajectory
+        stamps = np.array([stamp for stamp, _ in poses], np.int64)
+        return Trajectory(stamps, np.array([T for _, T in poses], np.float64).reshape(-1, 4, 4))
+
+    def _map(self, frame: SyncedFrame) -> None:
+        wall, cpu = time.perf_counter_ns(), time.process_time_ns()
+        self.mapper.process(frame)
+        wall, cpu = time.perf_counter_ns() - wall, time.process_time_ns() - cpu
+        self.statistics.add_frame(wall / _NS_PER_MS, cpu / _NS_PER_MS, self.mapper.stage_ms)
+        self.statistics.add_lost(frame.lost)
+
+    def _drop(self, reason: str) -> None:
+        self.statistics.frames_dropped += 1
+        self.statistics.add_lost({reason: 1})
+
+
+def warm_up(config: Config, folder: Path, make: MakeMapper = pipeline) -> float:
+    """Have every kernel compiled or loaded before the first frame, on a small made-up room; returns the seconds."""
+    start = time.perf_counter()
+    small = msgspec.structs.replace(config.voxel_map, memory_budget_mb=_WARM_UP_MB)
+    folder.mkdir(parents=True, exist_ok=True)
+    mapping = StreamMapping(msgspec.structs.replace(config, voxel_map=small), folder, make)
+    for number, (topic, message) in enumerate(_room()):
+        mapping.take(Sent(number, topic, message.ROS_TYPE, 0, 0, message.encode()))
+    mapping.mapper.finish()
+    del mapping
+    gc.collect()
+    return time.perf_counter() - start
+
+
+def _room() -> Iterator[tuple[str, Message]]:
+    """Messages of a few frames in a room, of every kind that a frame can hold."""
+    rng = np.random.default_rng(0)
+    yield topics.RIG.name, Text('{"topics": {}}')
+    forward = np.array([-0.5, 0.5, -0.5, 0.5])  # quaternion of an optical frame that looks along x
+    mount = TransformStamped(Header(0, "lidar"), "cam", np.zeros(3), forward)
+    yield topics.TF_STATIC.name, TFMessage((mount,))
+    K, P = np.array([60.0, 0, 32, 0, 60, 32, 0, 0, 1]), np.zeros(12)
+    yield topics.CAMERA_INFO.name, CameraInfo(Header(0, "cam"), 64, 64, "plumb_bob", np.zeros(5), K, np.eye(3).ravel(), P)
+    picture = cv2.imencode(".jpg", rng.integers(0, 255, (64, 64, 3)).astype(np.uint8))[1].tobytes()
+    for k in range(_WARM_UP_FRAMES):
+        stamp = k * _FRAME_NS
+        for sample in range(20):
+            at = stamp + sample * _FRAME_NS // 20
+            yield topics.IMU.name, Imu(Header(at, "lidar"), np.zeros(3), np.array([0.0, 0.0, 9.81]))
+        yield topics.CAMERA_IMAGE.name, CompressedImage(Header(stamp + _FRAME_NS // 2, "cam"), "jpeg", picture)
+        n = 6000
+        points = rng.uniform([-6, -4, -1.5], [6, 4, 2.5], (n, 3)).astype(np.float32)
+        wall = rng.integers(0, 3, n)
+        points[wall == 0, 0], points[wall == 1, 1], points[wall == 2, 2] = 6.0, -4.0, -1.5
+        offset = np.linspace(0, _FRAME_NS - 1, n).astype(np.uint32)
+        yield topics.LIDAR_POINTS.name, cloud_message(stamp, points, np.full(n, 0.5, np.float32), offset_ns=offset)
