@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from artemis_edge.commands import models, output, rig, session, texture, tui
+from artemis_edge.commands import models, output, replay, rig, run, session, texture, tui
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -100,6 +100,8 @@ def _parser() -> argparse.ArgumentParser:
         output.add_export,
         _check,
         session.add,
+        replay.add,
+        run.add,
         models.add,
         rig.add,
     ):

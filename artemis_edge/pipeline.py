@@ -105,6 +105,14 @@ class Pipeline:
         self.pager.file.close()
         return size
 
+    def before_copy(self) -> None:
+        """The process is about to be copied by a fork."""
+        self.pager.file.flush()
+
+    def after_copy(self) -> None:
+        """This is a copy that goes on in the place of its original."""
+        self.pager.file.reopen()
+
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
         start = time.perf_counter()

@@ -84,6 +84,7 @@ class Synchroniser:
         self._boot: int | None = None
         self._series: int | None = None
         self._armed = False
+        self._triggered = False  # whether a trigger of this boot was told
         self.undated: Counter[str] = Counter()
 
     # --- what the devices say ---
@@ -103,7 +104,8 @@ class Synchroniser:
             generated = bool(event.flags & PPS_GENERATED)
             self.pulse.add(event.count, event.board_ns, generated=generated)
             return []
-        if event.series != self._series:
+        first, self._triggered = not self._triggered, True
+        if event.series != self._series or (first and self._armed):
             self._new_series(event.series)
         elif self._armed:  # it was on its way when the board was armed
             self.undated["trigger before arm"] += 1
@@ -211,6 +213,7 @@ class Synchroniser:
         if self._boot is not None:
             self.pulse.restart(self.session_of_host(event.rx_ns))
         self._boot = event.boot
+        self._triggered = False
         self._host.restart()
         self._by_lidar.restart()
         self._new_series(event.series)

@@ -55,7 +55,7 @@ class _Photo:
 class FrameAssembler:
     """``take`` the messages one by one. ``lost`` counts by reason what no frame got.
 
-    ``next_index`` is the index of the next frame.
+    ``next_index`` is the index of the next frame, ``models`` are the cameras by the topic of their CameraInfo.
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class FrameAssembler:
         self.next_index = 0
         self.lost: dict[str, int] = {}
         self._tree = TransformTree()
-        self._models: dict[str, CameraModel] = {}
+        self.models: dict[str, CameraModel] = {}
         self._formats: dict[str, CloudFormat] = {}
         self._begin()
 
@@ -106,7 +106,7 @@ class FrameAssembler:
         if sent.ros_type == CameraInfo.ROS_TYPE:
             model = camera_model(CameraInfo.decode(sent.data), rectified=False)
             if model is not None:
-                self._models[sent.topic] = model
+                self.models[sent.topic] = model
         elif sent.topic == topics.TF_STATIC.name:
             for item in TFMessage.decode(sent.data).transforms:
                 self._tree.add(
@@ -129,7 +129,9 @@ class FrameAssembler:
             self._formats[sent.topic] = settle_format(message)
         points = decode_cloud(message, self._formats.get(sent.topic, CloudFormat()))
         add_counts(self._counts, points.lost)
-        scan = LidarScan(points.points, header.stamp_ns, points.offset_s, points.intensity, name=header.frame_id)
+        scan = LidarScan(
+            points.points, header.stamp_ns, points.offset_s, points.intensity, name=header.frame_id
+        )
         if len(points.points):
             self._scans.append((header, scan))
         return header
@@ -152,7 +154,7 @@ class FrameAssembler:
         """Scans with their mounting, the primary first."""
         found = []
         for header, scan in sorted(self._scans, key=lambda pair: pair[0].frame_id != lidar):
-            T = self._mounting(lidar, header.frame_id)
+            T = self.mounting(lidar, header.frame_id)
             if T is None:
                 self._count("clouds_without_mounting")
             else:
@@ -161,8 +163,8 @@ class FrameAssembler:
         return found
 
     def _image(self, photo: _Photo, lidar: str) -> CameraImage | None:
-        model = next((self._models[name] for name in info_topics(photo.topic) if name in self._models), None)
-        T = self._mounting(photo.frame_id, lidar)
+        model = next((self.models[name] for name in info_topics(photo.topic) if name in self.models), None)
+        T = self.mounting(photo.frame_id, lidar)
         if model is None or T is None:
             self._count("images_uncalibrated" if model is None else "images_without_mounting")
             return None
@@ -173,14 +175,14 @@ class FrameAssembler:
         """Samples in the axes of the primary LiDAR, in order of time."""
         if not self._samples:
             return ImuSamples.empty()
-        T = self._mounting(lidar, self._imu_frame)
+        T = self.mounting(lidar, self._imu_frame)
         R = np.eye(3) if T is None else T[:3, :3]
         stamps = np.array([stamp for stamp, _ in self._samples], np.int64)
         values = np.array([value for _, value in self._samples])
         order = np.argsort(stamps, kind="stable")
         return ImuSamples(stamps[order], values[order, :3] @ R.T, values[order, 3:] @ R.T)
 
-    def _mounting(self, target: str, source: str) -> F64 | None:
+    def mounting(self, target: str, source: str) -> F64 | None:
         """T_target_source (4, 4), None where tf does not join them."""
         if target == source:
             return np.eye(4)

@@ -150,4 +150,6 @@ class GrowingFile:
                 channels[record.id] = record.topic, types.get(record.schema_id, "")
             elif isinstance(record, Message):
                 topic, ros_type = channels[record.channel_id]
-                yield Sent(record.sequence, topic, ros_type, record.log_time, record.publish_time, record.data)
+                yield Sent(
+                    record.sequence, topic, ros_type, record.log_time, record.publish_time, record.data
+                )

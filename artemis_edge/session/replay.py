@@ -69,11 +69,17 @@ def replay(
             wait(sent.log_ns)
             if mapping.take(sent):
                 done = mapping.assembler.next_index
-                report(done, 0, f"{mapping.statistics.frame_ms[-1]:.0f} ms" if mapping.statistics.frame_ms else "")
+                report(
+                    done,
+                    0,
+                    f"{mapping.statistics.frame_ms[-1]:.0f} ms" if mapping.statistics.frame_ms else "",
+                )
             if interrupt.asked:
                 break
         if not mapping.statistics.frame_ms:
-            raise InputError(f"{session} has no LiDAR frames; 'artemis-edge session info {session}' lists what it has")
+            raise InputError(
+                f"{session} has no LiDAR frames; 'artemis-edge session info {session}' lists what it has"
+            )
         saved = mapping.save(out)
     if saved["fault"]:
         raise RunError(f"{saved['fault']}; kept in {out}: {', '.join(saved['kept'])}")

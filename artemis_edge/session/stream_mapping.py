@@ -21,8 +21,16 @@ from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.runtime import MakeMapper, pipeline, write_results
 from artemis_edge.session.assembly import FrameAssembler
 from artemis_edge.session.message_ring import Sent
-from artemis_edge.session.messages import CameraInfo, CompressedImage, Header, Imu, Message, Text, TFMessage
-from artemis_edge.session.messages import TransformStamped
+from artemis_edge.session.messages import (
+    CameraInfo,
+    CompressedImage,
+    Header,
+    Imu,
+    Message,
+    Text,
+    TFMessage,
+    TransformStamped,
+)
 from artemis_edge.session.photos import HeldOut
 from artemis_edge.session.results import Results, prepare
 from artemis_edge.session.statistics import RunStatistics
@@ -124,17 +132,26 @@ def _room() -> Iterator[tuple[str, Message]]:
     mount = TransformStamped(Header(0, "lidar"), "cam", np.zeros(3), forward)
     yield topics.TF_STATIC.name, TFMessage((mount,))
     K, P = np.array([60.0, 0, 32, 0, 60, 32, 0, 0, 1]), np.zeros(12)
-    yield topics.CAMERA_INFO.name, CameraInfo(Header(0, "cam"), 64, 64, "plumb_bob", np.zeros(5), K, np.eye(3).ravel(), P)
+    yield (
+        topics.CAMERA_INFO.name,
+        CameraInfo(Header(0, "cam"), 64, 64, "plumb_bob", np.zeros(5), K, np.eye(3).ravel(), P),
+    )
     picture = cv2.imencode(".jpg", rng.integers(0, 255, (64, 64, 3)).astype(np.uint8))[1].tobytes()
     for k in range(_WARM_UP_FRAMES):
         stamp = k * _FRAME_NS
         for sample in range(20):
             at = stamp + sample * _FRAME_NS // 20
             yield topics.IMU.name, Imu(Header(at, "lidar"), np.zeros(3), np.array([0.0, 0.0, 9.81]))
-        yield topics.CAMERA_IMAGE.name, CompressedImage(Header(stamp + _FRAME_NS // 2, "cam"), "jpeg", picture)
+        yield (
+            topics.CAMERA_IMAGE.name,
+            CompressedImage(Header(stamp + _FRAME_NS // 2, "cam"), "jpeg", picture),
+        )
         n = 6000
         points = rng.uniform([-6, -4, -1.5], [6, 4, 2.5], (n, 3)).astype(np.float32)
         wall = rng.integers(0, 3, n)
         points[wall == 0, 0], points[wall == 1, 1], points[wall == 2, 2] = 6.0, -4.0, -1.5
         offset = np.linspace(0, _FRAME_NS - 1, n).astype(np.uint32)
-        yield topics.LIDAR_POINTS.name, cloud_message(stamp, points, np.full(n, 0.5, np.float32), offset_ns=offset)
+        yield (
+            topics.LIDAR_POINTS.name,
+            cloud_message(stamp, points, np.full(n, 0.5, np.float32), offset_ns=offset),
+        )

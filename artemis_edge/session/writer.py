@@ -198,15 +198,7 @@ class SessionWriter:
         topic: str = topics.CAMERA_INFO.name,
     ) -> None:
         """The camera's model, distortion in the order of ``plumb_bob``."""
-        K = np.array([model.fx, 0.0, model.cx, 0.0, model.fy, model.cy, 0.0, 0.0, 1.0])
-        P = np.zeros((3, 4))
-        P[:, :3] = K.reshape(3, 3)
-        d = np.array(model.distortion, np.float64)
-        header = Header(stamp_ns, frame_id)
-        message = CameraInfo(
-            header, model.height, model.width, "plumb_bob", d, K, np.eye(3).ravel(), P.ravel()
-        )
-        self.write(topic, message, stamp_ns, receive_ns)
+        self.write(topic, camera_info(stamp_ns, model, frame_id), stamp_ns, receive_ns)
 
     def write_tf(
         self, stamp_ns: int, parent: str, child: str, T_parent_child: F64, *, receive_ns: int | None = None
@@ -347,6 +339,15 @@ class SessionWriter:
         return RunError(
             f"cannot write the session {self.path}: {error.strerror}; free space or choose another disk"
         )
+
+
+def camera_info(stamp_ns: int, model: CameraModel, frame_id: str) -> CameraInfo:
+    """The message of a camera's model, distortion in the order of ``plumb_bob``."""
+    K = np.array([model.fx, 0.0, model.cx, 0.0, model.fy, model.cy, 0.0, 0.0, 1.0])
+    P = np.zeros((3, 4))
+    P[:, :3] = K.reshape(3, 3)
+    d, R, header = np.array(model.distortion, np.float64), np.eye(3).ravel(), Header(stamp_ns, frame_id)
+    return CameraInfo(header, model.height, model.width, "plumb_bob", d, K, R, P.ravel())
 
 
 def cloud_message(

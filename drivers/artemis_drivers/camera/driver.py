@@ -88,7 +88,8 @@ class Camera(DeviceThread):
                 elif now - heard > SILENT_S and self._state == State.RUNNING:
                     self._counts["silent"] += 1
                     self._become(
-                        State.SILENT, f"{self.settings.name} gives no photographs: check its trigger cable (FSIN)"
+                        State.SILENT,
+                        f"{self.settings.name} gives no photographs: check its trigger cable (FSIN)",
                     )
                 continue
             heard = now

@@ -84,7 +84,9 @@ def put(ring: Ring, frame: CameraFrame, rx_ns: int) -> bool:
     field = ring.field
     field["data"][row, : len(frame.data)] = np.frombuffer(frame.data, np.uint8)
     values = (rx_ns, frame.sequence, frame.device_ns, frame.exposure_ns, frame.gain, frame.temperature_c)
-    for name, value in zip(("rx_ns", "sequence", "device_ns", "exposure_ns", "gain", "temperature_c"), values, strict=True):
+    for name, value in zip(
+        ("rx_ns", "sequence", "device_ns", "exposure_ns", "gain", "temperature_c"), values, strict=True
+    ):
         field[name][row] = value
     field["width"][row], field["height"][row], field["size"][row] = frame.width, frame.height, len(frame.data)
     field["encoding"][row] = ENCODINGS.index(frame.encoding)

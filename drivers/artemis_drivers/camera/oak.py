@@ -34,7 +34,11 @@ def load() -> Any:
 def to_frame(message: Any, jpeg_quality: int = 0) -> CameraFrame:
     """The photograph in an ImgFrame; OSError for a type of image that is not handled."""
     dai = load()
-    types = {dai.ImgFrame.Type.GRAY8: "mono8", dai.ImgFrame.Type.BGR888i: "bgr8", dai.ImgFrame.Type.RGB888i: "rgb8"}
+    types = {
+        dai.ImgFrame.Type.GRAY8: "mono8",
+        dai.ImgFrame.Type.BGR888i: "bgr8",
+        dai.ImgFrame.Type.RGB888i: "rgb8",
+    }
     kind = message.getType()
     if kind == dai.ImgFrame.Type.NV12:
         pixels, encoding = message.getCvFrame(), "bgr8"

@@ -64,7 +64,9 @@ class SharedSource:
                 self._file = (status.st_dev, status.st_ino)
                 self._reader = RingReader(_mapped(file.fileno(), self.settings.most_bytes))
         except (OSError, ValueError) as fault:
-            raise DriverError(f"{path} is not there or of another size ({fault}): start the camera's program") from fault
+            raise DriverError(
+                f"{path} is not there or of another size ({fault}): start the camera's program"
+            ) from fault
 
     def next(self, timeout_s: float) -> CameraFrame | None:
         """The next photograph; OSError when the file was taken away or made anew."""

@@ -1,0 +1,218 @@
+"""One session: its folder, the recorder and the mapping, and what is done when one of them dies."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from artemis_edge import config as mapping_config
+from artemis_edge.errors import InputError
+from artemis_edge.service import settings
+from artemis_edge.service.children import Child
+from artemis_edge.service.mapper import MapperTask
+from artemis_edge.service.outlet import Outlet
+from artemis_edge.service.settings import RunConfig
+from artemis_edge.session.feed import recorded
+from artemis_edge.session.recorder import RecorderTask
+from artemis_edge.session.verify import CONFIG_NAME
+
+RESULT = "result"
+_MB = 1_000_000
+_MOST_RESTARTS = 5
+_MAPPING_NICE = 5  # capture and recording go first
+_PR_SET_CHILD_SUBREAPER = 36
+
+#: Told of what happened: an event for the session, the log and the clients.
+Tell = Callable[[dict[str, Any]], None]
+
+
+class LiveSession:
+    """``begin`` it, ``turn`` often, ``end`` it, ``turn`` until it is ``over``. ``fault`` is a sentence, or empty."""
+
+    def __init__(
+        self, config: RunConfig, folder: Path, outlet: Outlet, tell: Tell, about: dict[str, Any]
+    ) -> None:
+        self.config, self.folder, self.outlet = config, folder, outlet
+        self.fault = ""
+        self.begun_s = time.monotonic()
+        self.ended_s: float | None = None
+        self.recorder_restarts = self.mapper_restarts = 0
+        self._tell, self._about = tell, about
+        self._first = self._stop_at = 0
+        self._adopted: set[int] = set()
+        self.recorder_last: dict[str, Any] = {}
+        self.mapper_last: dict[str, Any] = {}
+        self.recorder: Child | None = None
+        self.mapper: Child | None = None
+
+    def begin(self) -> None:
+        """From now on everything is recorded; InputError if the folder cannot be made."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"cannot make the session {self.folder}: {error.strerror}; choose another --session"
+            ) from None
+        _adopt_orphans()
+        self._first = self.outlet.open(self.config, self._about)
+        self.recorder = self._start_recorder(self._first)
+        if self.config.service.mapping:
+            self.mapper = self._start_mapper()
+
+    def end(self) -> None:
+        """No more messages: what there is will be written and mapped."""
+        if self.ended_s is None:
+            self.ended_s = time.monotonic()
+            self._stop_at = self.outlet.close()
+            for child in (self.recorder, self.mapper):
+                if child is not None:
+                    child.tell("stop", at=self._stop_at)
+
+    @property
+    def over(self) -> bool:
+        """Whether all is written."""
+        return self.ended_s is not None and self.recorder is None and self.mapper is None
+
+    def turn(self) -> None:
+        """Hear the processes; start again what has died."""
+        self._reap()
+        if self.recorder is not None:
+            self.recorder.hear()
+            if not self.recorder.alive:
+                self._recorder_ended(self.recorder)
+        if self.mapper is not None:
+            for line in self.mapper.hear():
+                self._mapper_says(line)
+            if self.mapper.channel.closed:
+                self._mapper_ended(self.mapper)
+
+    def hurry(self) -> None:
+        """Give up the map; the recording is closed all the same."""
+        if self.mapper is not None:
+            self._kill_mapper(self.mapper)
+            self.mapper = None
+            self.fault = (
+                self.fault or "the map was not saved; 'artemis-edge replay' makes it from the recording"
+            )
+
+    def state(self) -> dict[str, Any]:
+        """How both do."""
+        until = self.ended_s or time.monotonic()
+        return {
+            "folder": str(self.folder),
+            "seconds": round(until - self.begun_s, 1),
+            "recorder": self.recorder.latest if self.recorder is not None else self.recorder_last,
+            "recorder_restarts": self.recorder_restarts,
+            "mapping": self.mapper.latest if self.mapper is not None else self.mapper_last,
+            "mapping_restarts": self.mapper_restarts,
+            "fault": self.fault,
+        }
+
+    def _start_recorder(self, first: int) -> Child:
+        s = self.config.service
+        task = RecorderTask(
+            str(self.folder),
+            first,
+            {
+                "run.toml": settings.to_toml(self.config),
+                CONFIG_NAME: mapping_config.to_toml(self.config.mapping),
+            },
+            {"session": {name: str(value) for name, value in self._about.items()}},
+            s.split_mb * _MB,
+            s.reserve_mb * _MB,
+        )
+        return Child("artemis_edge.session.recorder", [self.outlet.ring.descriptor], task)
+
+    def _start_mapper(self) -> Child:
+        task = MapperTask(
+            str(self.folder),
+            str(self.folder / RESULT),
+            self._first,
+            mapping_config.to_toml(self.config.mapping),
+            self.config.service.checkpoint_s,
+        )
+        child = Child("artemis_edge.service.mapper", [self.outlet.ring.descriptor], task, _MAPPING_NICE)
+        if self.ended_s is not None:
+            child.tell("stop", at=self._stop_at)
+        return child
+
+    def _recorder_ended(self, child: Child) -> None:
+        """Ended in order, or died: then another one goes on where the last one's file ends."""
+        child.hear()
+        self.recorder_last, self.recorder = child.latest, None
+        child.end(0.0)
+        if child.latest.get("full"):
+            self.fault = self.fault or str(child.latest["full"])
+        elif child.process.returncode != 0 and self.recorder_restarts < _MOST_RESTARTS:
+            self.recorder_restarts += 1
+            first = max((sent.number + 1 for sent in recorded(self.folder, self._first)), default=self._first)
+            self.recorder = self._start_recorder(first)
+            if self.ended_s is not None:
+                self.recorder.tell("stop")
+            self._tell({"kind": "recorder_restarted", "first": first, "ring_oldest": self.outlet.ring.oldest})
+        elif child.process.returncode != 0:
+            self.fault = self.fault or "the recorder keeps ending; see the log"
+
+    def _mapper_says(self, line: dict[str, Any]) -> None:
+        if line.get("resumed"):
+            assert self.mapper is not None
+            self._adopted.add(int(line["pid"]))
+            self.mapper_restarts += 1
+            frame = int(line.get("frames", 0))
+            message = f"the mapping ended and goes on from frame {frame}; nothing recorded is lost"
+            self._tell({"kind": "mapping_restarted", "frame": frame, "message": message})
+        if line.get("state") in ("saved", "failed") and line.get("fault"):
+            self.fault = self.fault or str(line["fault"])
+
+    def _mapper_ended(self, child: Child) -> None:
+        """Process and copies are gone: in order, or all died, then it is mapped anew from the recording."""
+        self.mapper_last, self.mapper = child.latest, None
+        child.end(5.0)
+        state = child.latest.get("state")
+        if state in ("saved", "failed"):
+            return
+        if self.mapper_restarts < _MOST_RESTARTS:
+            self.mapper_restarts += 1
+            self.mapper = self._start_mapper()
+            self._tell(
+                {"kind": "mapping_restarted", "frame": 0, "message": "the mapping ended and begins anew"}
+            )
+        else:
+            self.fault = (
+                self.fault or "the mapping keeps ending; recording goes on, map it later with reprocess"
+            )
+
+    def _kill_mapper(self, child: Child) -> None:
+        """Its channel closed, the copy that takes over finds nobody and ends."""
+        child.channel.socket.close()
+        child.channel.closed = True
+        child.process.kill()
+        child.process.wait()
+
+    def _reap(self) -> None:
+        """Copies of the mapping that took over and have ended are our children by adoption."""
+        for pid in [*self._adopted]:
+            try:
+                ended = os.waitpid(pid, os.WNOHANG)[0]
+            except ChildProcessError:
+                ended = pid
+            if ended:
+                self._adopted.discard(pid)
+
+
+def session_folder(sessions: Path, now: datetime) -> Path:
+    """A folder that is not there yet, named by the time."""
+    stem = now.strftime("%Y-%m-%d_%H-%M-%S")
+    folder, number = sessions / stem, 2
+    while folder.exists():
+        folder, number = sessions / f"{stem}_{number}", number + 1
+    return folder
+
+
+def _adopt_orphans() -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)

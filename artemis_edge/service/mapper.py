@@ -1,0 +1,214 @@
+"""The mapping process: maps what is recorded, from the ring and where that has moved on from the files.
+
+It says a few times a second how it does, and hears when to stop: after the last message until then it saves the map.
+When it dies, its last checkpoint goes on (checkpoint.py), and maps again what came since, from the recording.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from artemis_edge import health
+from artemis_edge.config import Config, from_toml
+from artemis_edge.errors import UserError
+from artemis_edge.service.checkpoint import Checkpoints
+from artemis_edge.session.feed import LiveFeed
+from artemis_edge.session.line_channel import LineChannel
+from artemis_edge.session.message_ring import MessageRing
+from artemis_edge.session.results import prepare, scratch
+from artemis_edge.session.stream_mapping import StreamMapping, warm_up
+
+_POLL_S = 0.005
+_SAY_S = 0.25
+_COLLECT_EVERY = 100  # frames
+_LATEST = 50  # frames that times are told of
+_PR_SET_PDEATHSIG = 1
+
+
+class MapperTask(Struct, frozen=True):
+    """What the service tells the mapping: ``config`` as TOML, the session's folder, where the map goes."""
+
+    folder: str
+    out: str
+    first: int = 0
+    config: str = ""
+    checkpoint_s: float = 20.0
+
+
+class LiveMapper:
+    """The loop. ``save`` at the end unless the service has gone."""
+
+    def __init__(self, task: MapperTask, ring: MessageRing, channel: LineChannel, pages: Path) -> None:
+        self.task, self.channel = task, channel
+        self.feed = LiveFeed(ring, Path(task.folder), task.first)
+        config = from_toml(task.config) if task.config else Config()
+        self.mapping = StreamMapping(config, pages)
+        self.checkpoints = Checkpoints(self._reopen)
+        self.mapping.before = self.checkpoints.working_on
+        self._config, self._pages = config, pages
+        self._stop_at: int | None = None
+        self._checked = time.monotonic()
+        self._said = 0.0
+
+    def run(self) -> None:
+        """Until it is told to stop and has mapped everything until then."""
+        try:
+            self._guard(self.checkpoints.take())
+            self._say("mapping", force=True)
+            self._loop()
+        except (UserError, ServiceGoneError):  # an orderly end, not to be tried again by the copy
+            self.checkpoints.close()
+            raise
+        self.checkpoints.close()
+
+    def _loop(self) -> None:
+        while self._stop_at is None or self.feed.next < self._stop_at:
+            sent = self.feed.take()
+            if sent is None:
+                time.sleep(_POLL_S)
+                self._tend()
+            elif self.mapping.take(sent):
+                self.checkpoints.working_on(-1)
+                self._after_frame()
+
+    def save(self) -> dict[str, Any]:
+        """The map and all results."""
+        self._say("saving", force=True)
+        return self.mapping.save(Path(self.task.out))
+
+    def _after_frame(self) -> None:
+        if self.mapping.assembler.next_index % _COLLECT_EVERY == 0:
+            gc.collect()
+        if time.monotonic() - self._checked > self.task.checkpoint_s:
+            _call(self.mapping.mapper, "before_copy")
+            self._guard(self.checkpoints.take())
+        self._tend()
+
+    def _guard(self, resumed: bool) -> None:
+        """A copy that takes over tells it, and leaves a copy of its own at once."""
+        while resumed:
+            self.mapping.skip |= self.checkpoints.fatal
+            resumed = self.checkpoints.guard_again()
+            if not resumed:
+                self._say("mapping", force=True, resumed=True)
+        self._checked = time.monotonic()
+
+    def _tend(self) -> None:
+        for line in self.channel.lines():
+            if line.get("do") == "stop":
+                self._stop_at = int(line.get("at", 0))
+        if self.channel.closed:
+            raise ServiceGoneError
+        self._say("mapping")
+
+    def _reopen(self) -> None:
+        _call(self.mapping.mapper, "after_copy")
+
+    def _say(self, state: str, *, force: bool = False, resumed: bool = False) -> None:
+        now = time.monotonic()
+        if not force and now - self._said < _SAY_S:
+            return
+        self._said = now
+        self.channel.say({"state": state, "pid": os.getpid(), "resumed": resumed, **self.status()})
+
+    def status(self) -> dict[str, Any]:
+        """How it does."""
+        statistics, feed = self.mapping.statistics, self.feed
+        times = statistics.frame_ms[-_LATEST:]
+        pose = self.mapping.mapper.trajectory[-1][1] if self.mapping.mapper.trajectory else np.eye(4)
+        return {
+            "frames": self.mapping.assembler.next_index,
+            "mapped": len(statistics.frame_ms),
+            "dropped": statistics.frames_dropped,
+            "latest_ns": self.mapping.latest_ns,
+            "frame_ms": round(float(np.median(times)), 1) if times else 0.0,
+            "frame_ms_list": [round(t, 1) for t in times],
+            "stages_ms": {name: round(ms, 1) for name, ms in self.mapping.mapper.stage_ms.items()},
+            "waiting": feed.ring.published - feed.next,
+            "from_files": feed.from_files,
+            "missed": feed.missed,
+            "pose": [round(float(v), 4) for v in pose[:3].ravel()],
+            "lost": {**statistics.lost, **self.mapping.assembler.lost},
+            "fault": self.mapping.fault,
+            "deaths": self.checkpoints.deaths,
+            "checkpoint_s": round(time.monotonic() - self._checked, 1),
+            "fork_ms": round(self.checkpoints.fork_ms, 1),
+            "rss_mb": round(health.resident_mb(), 1),
+            "cpu_s": round(time.process_time(), 2),
+        }
+
+
+class ServiceGoneError(Exception):
+    """Nobody is there to map for; the recording is on the disk and can be mapped again."""
+
+
+def _call(mapper: object, name: str) -> None:
+    """A method that the mapper may have."""
+    method = getattr(mapper, name, None)
+    if method is not None:
+        method()
+
+
+def _end_with_the_service() -> None:
+    """Also a copy of this process ends when the service does."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _work(task: MapperTask, ring: MessageRing, channel: LineChannel) -> None:
+    out = Path(task.out)
+    prepare(out)
+    with scratch(out) as pages:
+        channel.say({"state": "warming up", "pid": os.getpid()})
+        warm_up(from_toml(task.config) if task.config else Config(), pages / "warm-up")
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        mapper = LiveMapper(task, ring, channel, pages)
+        mapper.run()
+        channel.say({"state": "saved", "pid": os.getpid(), **mapper.status(), **_told(mapper.save())})
+
+
+def _told(saved: dict[str, Any]) -> dict[str, Any]:
+    report = saved["report"]
+    known = ("frames", "triangles", "area_m2", "peak_rss_mb", "realtime_factor")
+    return {
+        "kept": saved["kept"],
+        "fault": saved["fault"],
+        "report": {k: report[k] for k in known if k in report},
+    }
+
+
+def main(arguments: list[str]) -> int:
+    """``mapper.py RING SOCKET TASK``: file descriptors of the ring and the socket, and the task as JSON."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with_the_service()
+    cv2.setNumThreads(1)  # a pool of threads would not survive a fork
+    ring, sock, text = int(arguments[0]), int(arguments[1]), arguments[2]
+    task, channel = msgspec.json.decode(text, type=MapperTask), LineChannel(socket.socket(fileno=sock))
+    try:
+        _work(task, MessageRing(ring), channel)
+    except ServiceGoneError:
+        return 1
+    except UserError as error:
+        channel.say({"state": "failed", "fault": str(error)})
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,166 @@
+"""The file of ``artemis-edge run --config FILE``: the devices of the rig, how they are mounted, and the service."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import tomli_w
+from artemis_drivers.camera.settings import CameraSettings
+from artemis_drivers.imu_serial.settings import ImuSettings
+from artemis_drivers.livox_avia.settings import AviaConfig
+from artemis_drivers.livox_mid360.settings import Mid360Config
+from artemis_drivers.trigger.settings import TriggerSettings
+from msgspec import Meta, Struct
+
+from artemis_edge.config import Config
+from artemis_edge.errors import InputError
+from artemis_edge.frames import F64, CameraModel
+from artemis_edge.trajectory import matrix_from_quaternion
+
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Mount(Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a sensor sits: maps its coordinates to those of what it is mounted to."""
+
+    translation_m: Triple = (0.0, 0.0, 0.0)
+    quaternion: Annotated[Quaternion, Meta(description="x, y, z, w.")] = (0.0, 0.0, 0.0, 1.0)
+
+    def matrix(self) -> F64:
+        """T_parent_sensor (4, 4)."""
+        return matrix_from_quaternion(np.array(self.translation_m), np.array(self.quaternion))
+
+
+class LidarEntry(Struct, frozen=True, forbid_unknown_fields=True):
+    """A LiDAR: one of the two models. The first one of the file is the primary."""
+
+    avia: AviaConfig | None = None
+    mid360: Mid360Config | None = None
+    mount: Annotated[Mount, Meta(description="To the primary LiDAR (T_lidar_sensor).")] = Mount()
+
+
+class ImuEntry(Struct, frozen=True, forbid_unknown_fields=True):
+    """A serial IMU."""
+
+    device: ImuSettings
+    mount: Annotated[Mount, Meta(description="To the primary LiDAR (T_lidar_imu).")] = Mount()
+    latency_us: Annotated[
+        int, Meta(description="Least time from sampling to arrival, less that of the board's messages.")
+    ] = 0
+
+
+class CameraEntry(Struct, frozen=True, forbid_unknown_fields=True):
+    """A camera with its calibration."""
+
+    device: CameraSettings
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    mount: Annotated[Mount, Meta(description="To the primary LiDAR (T_lidar_cam).")] = Mount()
+    delay_us: Annotated[int, Meta(description="From trigger edge to start of exposure.", ge=0)] = 0
+    latency_us: Annotated[
+        int | None, Meta(description="Least time from end of exposure to arrival; none: not known.")
+    ] = None
+    strobe: Annotated[int, Meta(description="Number of its strobe input on the board.", ge=0, le=7)] = 0
+
+    def model(self) -> CameraModel:
+        """The lens."""
+        return CameraModel(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
+
+
+class ServiceSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Recording and control."""
+
+    sessions: Annotated[str, Meta(description="Folder of the recordings.")] = "sessions"
+    socket: Annotated[
+        str, Meta(description="Control socket; empty: artemis.sock in the runtime directory.")
+    ] = ""
+    socket_mode: Annotated[
+        str, Meta(description="Who may use it, octal file mode.", pattern="^[0-7]{3}$")
+    ] = "660"
+    record_at_start: Annotated[bool, Meta(description="Record as soon as the devices run.")] = True
+    start_patience_s: Annotated[
+        float, Meta(description="After which recording begins with the devices that run.", ge=0.0, le=600.0)
+    ] = 10.0
+    raw_packets: Annotated[bool, Meta(description="Record what devices sent, byte for byte, as well.")] = True
+    ring_mb: Annotated[float, Meta(description="Messages in memory, for a slow disk.", ge=8.0, le=4096.0)] = (
+        96.0
+    )
+    split_mb: Annotated[int, Meta(description="Size of a file of a recording.", ge=1, le=100_000)] = 1024
+    reserve_mb: Annotated[int, Meta(description="Disk that is left free.", ge=0, le=1_000_000)] = 1000
+    checkpoint_s: Annotated[float, Meta(description="Between checkpoints of the map.", ge=1.0, le=30.0)] = (
+        20.0
+    )
+    mapping: Annotated[bool, Meta(description="Map while recording.")] = True
+
+
+class RunConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    lidar: tuple[LidarEntry, ...] = (LidarEntry(avia=AviaConfig()),)
+    imu: ImuEntry | None = None
+    camera: tuple[CameraEntry, ...] = ()
+    trigger: TriggerSettings | None = None
+    lidar_imu: Annotated[
+        bool, Meta(description="Use the LiDAR's own IMU where there is no other; mounted as lidar_imu_mount.")
+    ] = True
+    lidar_imu_mount: Mount = Mount()
+    service: ServiceSettings = ServiceSettings()
+    mapping: Config = Config()
+
+
+def load(file: Path | None) -> RunConfig:
+    """The settings in a file, those of a bare Avia without one; InputError naming the field."""
+    if file is None:
+        return RunConfig()
+    try:
+        tree: dict[str, Any] = tomllib.loads(file.read_text())
+        config = msgspec.convert(tree, RunConfig)
+    except OSError as error:
+        raise InputError(f"cannot read configuration {file}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file} is not valid TOML: {error}") from None
+    except msgspec.ValidationError as error:
+        raise InputError(f"{file}: {error}; docs/hardware.md tells what the file may hold") from None
+    _require_sense(config, file)
+    return config
+
+
+def to_toml(config: RunConfig) -> str:
+    """The effective settings."""
+    return tomli_w.dumps(_without_none(msgspec.to_builtins(config)))
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    return [_without_none(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _require_sense(config: RunConfig, file: Path) -> None:
+    for number, entry in enumerate(config.lidar):
+        if (entry.avia is None) == (entry.mid360 is None):
+            raise InputError(f"{file}: lidar[{number}] must have either avia or mid360")
+    names = [device_name(entry) for entry in config.lidar] + [camera.device.name for camera in config.camera]
+    names += [config.imu.device.name] if config.imu is not None else []
+    names += [config.trigger.name] if config.trigger is not None else []
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{file}: {names.count(name)} devices are named {name}; give each its own name")
+    if not config.lidar:
+        raise InputError(f"{file}: there is no LiDAR; add a [[lidar]]")
+
+
+def device_name(entry: LidarEntry) -> str:
+    """The name of a LiDAR."""
+    device = entry.avia or entry.mid360
+    return "" if device is None else device.name
