@@ -79,6 +79,13 @@ class Keeper:
             for image, T_world_lidar in zip(tracked.images, tracked.image_poses, strict=True):
                 self._keyframes.offer(image, T_world_lidar @ inverse(image.T_cam_lidar))
 
+    def after_copy(self) -> None:
+        """In a copy of the process that takes over (service/checkpoint.py): as the files are now."""
+        self._points.after_copy()
+        self._images.after_copy()
+        if self._keyframes is not None:
+            self._keyframes.after_copy()
+
     def save(self, folder: Path, trajectory: Trajectory, report: Report = silent) -> int:
         """Write points, images and keyframes into a map's folder and colour the points; returns the size in bytes."""
         self.store()

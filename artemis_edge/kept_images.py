@@ -45,6 +45,10 @@ class ImageSpool:
                     (self._folder / file).unlink()
             self._kept = [row for row in self._kept if row[0] % self._stride == 0]
 
+    def after_copy(self) -> None:
+        """In a copy of the process that takes over: the other may have thinned out the images."""
+        self._kept = [row for row in self._kept if (self._folder / row[1]).exists()]
+
     def save(self, folder: Path, trajectory: Trajectory) -> int:
         """Move the images with a pose into a map's folder and write their index; returns the size in bytes.
 

@@ -92,6 +92,13 @@ class PointSpool:
             file.truncate(written * ROW.itemsize)
         self.rows, self.stride = written, self.stride * 2
 
+    def after_copy(self) -> None:
+        """In a copy of the process that takes over: what the other appended is not known here."""
+        if self._path.exists():
+            with self._path.open("r+b") as file:
+                file.truncate(min(self.rows * ROW.itemsize, self._path.stat().st_size))
+            self.rows = self._path.stat().st_size // ROW.itemsize
+
     def save(self, folder: Path) -> int:
         """Write ``points.bin`` into a map's folder, without colours; returns its size in bytes (0: no points)."""
         if self.rows == 0:

@@ -105,9 +105,7 @@ def reprocess(
             run.flush()
         count_losses(statistics, source, tracker, mapper)
         results = Results(request.out)
-        outcome = write_results(
-            results, run.trajectory(), mapper, keeper, photos, statistics, evaluate
-        )
+        outcome = write_results(results, run.trajectory(), mapper, keeper, photos, statistics, evaluate)
     _complain(run, results, request.out)
     if outcome is not None and not outcome["triangles"]:
         raise _nothing_meshed(outcome, request, results)

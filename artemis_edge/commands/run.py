@@ -13,9 +13,7 @@ from artemis_edge.errors import InputError
 def add(commands: Any) -> None:
     """Declare the command."""
     parser = command(commands, "run", run, "record and map with the devices of the rig, until stopped")
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="devices, mounting, service (docs/hardware.md)"
-    )
+    parser.add_argument("--config", metavar="FILE", help="devices, mounting, service (docs/hardware.md)")
     parser.add_argument(
         "--query", action="append", default=[], metavar="TEXT", help="what to look for; repeatable"
     )

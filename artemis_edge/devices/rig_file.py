@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from artemis_drivers.camera.settings import CameraSettings
@@ -15,7 +15,7 @@ from artemis_drivers.imu_serial.settings import ImuSettings
 from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.livox_mid360.settings import Mid360Config
 from artemis_drivers.trigger.settings import TriggerSettings
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from artemis_edge.devices.calibration import Calibration, read_calibration
 from artemis_edge.errors import InputError
@@ -36,6 +36,8 @@ class Profile(Struct, frozen=True, forbid_unknown_fields=True):
     trigger: str = ""
     calibration: str = ""
     override: dict[str, dict[str, Any]] = {}
+    service: Annotated[dict[str, Any], Meta(description="Of ``run``: recording, control socket.")] = {}
+    mapping: Annotated[dict[str, Any], Meta(description="Settings of the mapping (docs/tuning.md).")] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,8 @@ class RigFile:
     trigger: TriggerSettings | None
     calibration: Calibration
     sources: dict[str, str]
+    service: dict[str, Any] = field(default_factory=dict)
+    mapping: dict[str, Any] = field(default_factory=dict)
 
     def digests(self) -> dict[str, str]:
         """SHA-256 of each source file."""
@@ -91,6 +95,8 @@ def load_rig(profile: Path | str, folder: Path | None = None) -> RigFile:
         else None,
         calibration=_calibration(folders, chosen.calibration, sources),
         sources=sources,
+        service=chosen.service,
+        mapping=chosen.mapping,
     )
     _require_complete(rig, unused, path)
     return rig

@@ -96,6 +96,10 @@ class KeyframeStore:
             self._thin()
         return any(item is kept for item in self._kept)
 
+    def after_copy(self) -> None:
+        """In a copy of the process that takes over: the other may have thinned out the photographs."""
+        self._kept = [kept for kept in self._kept if (self.folder / kept.file).exists()]
+
     def save(self, map_folder: Path) -> int:
         """Move them into ``map/keyframes`` and write the index; returns bytes written."""
         into = map_folder / FOLDER

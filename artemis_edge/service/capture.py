@@ -64,8 +64,8 @@ class Capture:
         self._events = RingReader(rig.events) if rig.events is not None else None
         self._host_pulse = HostPulse() if rig.board is None else None
         self._cameras = [
-            _CameraFeed(camera, prefix)
-            for camera, prefix in zip(rig.cameras, camera_prefixes(config), strict=True)
+            _CameraFeed(camera, prefix, entry.time_offset_us * 1000)
+            for camera, prefix, entry in zip(rig.cameras, camera_prefixes(config), config.camera, strict=True)
         ]
         self._raw = _RawFeeds(rig, outlet)
         self._window_ns: int | None = None
@@ -206,7 +206,7 @@ class Capture:
     def _serial_imu(self) -> None:
         if self._imu is None or self.rig.config.imu is None:
             return
-        name = self.rig.config.imu.device.name
+        name, offset_ns = self.rig.config.imu.device.name, self.rig.config.imu.time_offset_us * 1000
         _, rows = self._imu.read()
         columns = zip(rows["device_ns"].tolist(), rows["boot"].tolist(), rows["rx_ns"].tolist(), strict=True)
         for k, (device_ns, boot, rx_ns) in enumerate(columns):
@@ -214,9 +214,9 @@ class Capture:
             if dated is None:
                 self.lost["imu_undated"] += 1
                 continue
-            self._imu_latest_ns = dated.stamp_ns
-            message = Imu(Header(dated.stamp_ns, "imu"), rows["gyro"][k], rows["accel"][k])
-            self.outlet.send(topics.IMU.name, message, dated.stamp_ns, rx_ns)
+            stamp_ns = self._imu_latest_ns = dated.stamp_ns + offset_ns
+            message = Imu(Header(stamp_ns, "imu"), rows["gyro"][k], rows["accel"][k])
+            self.outlet.send(topics.IMU.name, message, stamp_ns, rx_ns)
 
     def _lidar_imu(self) -> None:
         for number, cutter in enumerate(self._cutters):
@@ -279,6 +279,7 @@ class Capture:
             self._publish(feed, image.stamp_ns, *held)
 
     def _publish(self, feed: _CameraFeed, stamp_ns: int, rx_ns: int, frame: CameraFrame) -> None:
+        stamp_ns += feed.offset_ns
         feed.latest_ns = max(feed.latest_ns, stamp_ns)
         header = Header(stamp_ns, feed.name)
         exposure = CameraExposure(header, frame.exposure_ns / _SECOND_NS, frame.gain)
@@ -395,8 +396,9 @@ def _brief(health: Health) -> dict[str, Any]:
 class _CameraFeed:
     """The photographs of one camera that wait for their time."""
 
-    def __init__(self, camera: Camera, prefix: str) -> None:
+    def __init__(self, camera: Camera, prefix: str, offset_ns: int) -> None:
         self.camera, self.prefix, self.name = camera, prefix, camera.settings.name
+        self.offset_ns = offset_ns
         self.latest_ns = 0
         self._next = camera.frames.published
         self._held: dict[int, tuple[int, CameraFrame]] = {}

@@ -117,6 +117,7 @@ class LiveMapper:
 
     def _reopen(self) -> None:
         _call(self.mapping.mapper, "after_copy")
+        self.mapping.keeper.after_copy()
 
     def _say(self, state: str, *, force: bool = False, resumed: bool = False) -> None:
         now = time.monotonic()

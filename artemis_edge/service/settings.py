@@ -17,9 +17,11 @@ from artemis_drivers.trigger.settings import TriggerSettings
 from msgspec import Meta, Struct
 
 from artemis_edge.config import Config
+from artemis_edge.devices.calibration import Matrix
+from artemis_edge.devices.rig_file import RigFile, load_rig
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, CameraModel
-from artemis_edge.trajectory import matrix_from_quaternion
+from artemis_edge.trajectory import inverse, matrix_from_quaternion, quaternion_from_matrix
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -52,6 +54,7 @@ class ImuEntry(Struct, frozen=True, forbid_unknown_fields=True):
     latency_us: Annotated[
         int, Meta(description="Least time from sampling to arrival, less that of the board's messages.")
     ] = 0
+    time_offset_us: Annotated[int, Meta(description="Added to its stamps (calibrated).")] = 0
 
 
 class CameraEntry(Struct, frozen=True, forbid_unknown_fields=True):
@@ -71,6 +74,7 @@ class CameraEntry(Struct, frozen=True, forbid_unknown_fields=True):
         int | None, Meta(description="Least time from end of exposure to arrival; none: not known.")
     ] = None
     strobe: Annotated[int, Meta(description="Number of its strobe input on the board.", ge=0, le=7)] = 0
+    time_offset_us: Annotated[int, Meta(description="Added to its stamps (calibrated).")] = 0
 
     def model(self) -> CameraModel:
         """The lens."""
@@ -118,21 +122,78 @@ class RunConfig(Struct, frozen=True, forbid_unknown_fields=True):
     mapping: Config = Config()
 
 
-def load(file: Path | None) -> RunConfig:
-    """The settings in a file, those of a bare Avia without one; InputError naming the field."""
+def load(file: Path | str | None) -> RunConfig:
+    """The settings in a file, those of a bare Avia without one; InputError naming the field.
+
+    A rig profile (devices/rig_file.py), or all in one file, as every recording has it attached as ``run.toml``.
+    """
     if file is None:
         return RunConfig()
+    tree = _read(Path(file)) if Path(file).is_file() else {}
+    where = str(file)
+    if not any(isinstance(entry, dict) for entry in tree.get("lidar", [])):
+        return _of_rig(load_rig(file), where)
+    config: RunConfig = _convert(tree, RunConfig, where)
+    _require_sense(config, where)
+    return config
+
+
+def _of_rig(rig: RigFile, where: str) -> RunConfig:
+    calibration = rig.calibration
+    imu_offset, T_lidar_imu = round(calibration.imu_time_offset_s * 1e6), _mount(calibration.T_imu_lidar)
+    cameras = []
+    for device in rig.cameras:
+        c = calibration.cameras[device.name]
+        delay = round(getattr(device, "trigger_delay_us", 0.0))
+        offset = round(c.time_offset_s * 1e6)
+        entry = CameraEntry(
+            device, c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.distortion, _mount(c.T_cam_lidar), delay,
+            time_offset_us=offset,
+        )  # fmt: skip
+        cameras.append(entry)
+    lidars = tuple(
+        LidarEntry(avia=device) if isinstance(device, AviaConfig) else LidarEntry(mid360=device)
+        for device in rig.lidars
+    )
+    imu = None if rig.imu is None else ImuEntry(rig.imu, T_lidar_imu, time_offset_us=imu_offset)
+    service: ServiceSettings = _convert(rig.service, ServiceSettings, f"{where}: [service]")
+    mapping: Config = _convert(rig.mapping, Config, f"{where}: [mapping]")
+    config = RunConfig(
+        lidars,
+        imu,
+        tuple(cameras),
+        rig.trigger,
+        True,
+        T_lidar_imu if imu is None else Mount(),
+        service,
+        mapping,
+    )
+    _require_sense(config, where)
+    return config
+
+
+def _mount(T_sensor_lidar: Matrix) -> Mount:
+    """The calibration maps LiDAR coordinates to the sensor's."""
+    T = inverse(np.array(T_sensor_lidar, np.float64))
+    x, y, z = T[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_from_matrix(T).tolist()
+    return Mount((x, y, z), (qx, qy, qz, qw))
+
+
+def _read(file: Path) -> dict[str, Any]:
     try:
-        tree: dict[str, Any] = tomllib.loads(file.read_text())
-        config = msgspec.convert(tree, RunConfig)
+        return tomllib.loads(file.read_text())
     except OSError as error:
         raise InputError(f"cannot read configuration {file}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{file} is not valid TOML: {error}") from None
+
+
+def _convert(tree: dict[str, Any], kind: type[Any], where: str) -> Any:
+    try:
+        return msgspec.convert(tree, kind)
     except msgspec.ValidationError as error:
-        raise InputError(f"{file}: {error}; docs/hardware.md tells what the file may hold") from None
-    _require_sense(config, file)
-    return config
+        raise InputError(f"{where}: {error}; docs/hardware.md tells what the file may hold") from None
 
 
 def to_toml(config: RunConfig) -> str:
@@ -146,7 +207,7 @@ def _without_none(value: Any) -> Any:
     return [_without_none(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _require_sense(config: RunConfig, file: Path) -> None:
+def _require_sense(config: RunConfig, file: str) -> None:
     for number, entry in enumerate(config.lidar):
         if (entry.avia is None) == (entry.mid360 is None):
             raise InputError(f"{file}: lidar[{number}] must have either avia or mid360")

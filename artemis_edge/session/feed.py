@@ -21,6 +21,10 @@ def messages(path: Path) -> Iterator[Sent]:
     files = [file for file in bag_files(path) if file.suffix == ".mcap"]
     if not files:
         raise InputError(f"{path} holds no MCAP file; give a session")
+    return _all(files)
+
+
+def _all(files: list[Path]) -> Iterator[Sent]:
     number = 0
     for file in files:
         bag = McapBag(file)

@@ -16,6 +16,7 @@ from artemis_edge import topics
 from artemis_edge.config import Config, to_toml
 from artemis_edge.errors import InputError
 from artemis_edge.frames import SyncedFrame, Trajectory
+from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Mapper
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.runtime import MakeMapper, pipeline, write_results
@@ -54,6 +55,8 @@ class StreamMapping:
         self.assembler = FrameAssembler()
         self.odometry = LidarOdometry(config.odometry)
         self.mapper: Mapper = make(config, self.odometry, pages)
+        self.keeper = Keeper(pages, config.keep, config.segmentation)
+        self._prepare = self.keeper.between(lambda frame: frame, self.mapper)
         self.statistics = RunStatistics(name, _INPUT_HZ, config_toml=to_toml(config))
         self.skip: set[int] = set()
         self.latest_ns = 0
@@ -87,8 +90,9 @@ class StreamMapping:
         self.statistics.add_lost(self.assembler.lost)
         self.statistics.add_lost(self.mapper.lost)
         results = Results(out)
+        photos = HeldOut(out, 0)
         report = write_results(
-            results, self.trajectory(), self.mapper, HeldOut(out, 0), self.statistics, None
+            results, self.trajectory(), self.mapper, self.keeper, photos, self.statistics, None
         )
         return {"report": report or {}, "kept": results.kept, "fault": results.fault or ""}
 
@@ -99,6 +103,7 @@ class StreamMapping:
         return Trajectory(stamps, np.array([T for _, T in poses], np.float64).reshape(-1, 4, 4))
 
     def _map(self, frame: SyncedFrame) -> None:
+        frame = self._prepare(frame)
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
         self.mapper.process(frame)
         wall, cpu = time.perf_counter_ns() - wall, time.process_time_ns() - cpu

@@ -193,9 +193,8 @@ class WireRig:
         if self.camera is not None and played.model is not None:
             m = played.model
             entry = CameraEntry(
-                SharedSettings(str(self.folder / "cam"), "cam", _MOST_IMAGE_BYTES),
+                SharedSettings(str(self.folder / "cam"), most_bytes=_MOST_IMAGE_BYTES),
                 m.fx, m.fy, m.cx, m.cy, m.width, m.height, m.distortion, _mount(played.T_lidar_cam),
-                latency_us=_READOUT_NS // 1000,
             )  # fmt: skip
             camera = (entry,)
         if self.imu is not None:

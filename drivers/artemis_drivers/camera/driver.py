@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Mapping
 
 from artemis_drivers.base import DriverError, Health, State
-from artemis_drivers.camera.folder import FolderSource
+from artemis_drivers.camera.files import FilesSource
 from artemis_drivers.camera.frames import FRAME_SLOTS, FrameSource, frame_dtype, put
 from artemis_drivers.camera.oak import OakSource
-from artemis_drivers.camera.settings import CameraSettings, FolderSettings, OakSettings, most_bytes
+from artemis_drivers.camera.settings import CameraSettings, FilesSettings, OakSettings, most_bytes
 from artemis_drivers.camera.shared import SharedSource
 from artemis_drivers.device_thread import DeviceThread
 from artemis_drivers.ring import Ring
@@ -124,6 +124,6 @@ def source_of(settings: CameraSettings) -> FrameSource:
     """The source that the settings describe."""
     if isinstance(settings, OakSettings):
         return OakSource(settings)
-    if isinstance(settings, FolderSettings):
-        return FolderSource(settings)
+    if isinstance(settings, FilesSettings):
+        return FilesSource(settings)
     return SharedSource(settings)

@@ -20,6 +20,7 @@ from artemis_drivers.camera.settings import OakSettings
 
 _QUEUE = 16  # frames; the library's own default drops silently when the reader is late
 _ISO_OF_GAIN_1 = 100.0
+_TIE_GPIO = 38
 
 
 def load() -> Any:
@@ -83,14 +84,14 @@ class OakSource:
         """Connect, configure, start; DriverError if there is no such camera."""
         dai, s = load(), self.settings
         try:
-            device = dai.Device(dai.DeviceInfo(s.device)) if s.device else dai.Device()
+            config = board_config(dai, s)
+            device = dai.Device(config, dai.DeviceInfo(s.device)) if s.device else dai.Device(config)
             self._identity = {"serial": str(device.getDeviceId()), "model": str(device.getDeviceName())}
             self._pipeline = dai.Pipeline(device)
-            socket = getattr(dai.CameraBoardSocket, s.board_socket)
-            camera = self._pipeline.create(dai.node.Camera).build(socket, (s.width, s.height), s.rate_hz)
+            socket = getattr(dai.CameraBoardSocket, s.socket)
+            camera = self._pipeline.create(dai.node.Camera).build(socket, (s.width, s.height), s.fps)
             self._configure(dai, camera.initialControl)
-            kind = dai.ImgFrame.Type.BGR888i if s.colour else dai.ImgFrame.Type.GRAY8
-            output = camera.requestOutput((s.width, s.height), type=kind)
+            output = camera.requestOutput((s.width, s.height), type=dai.ImgFrame.Type.NV12)
             self._queue = output.createOutputQueue(maxSize=_QUEUE, blocking=True)
             self._pipeline.start()
         except RuntimeError as fault:
@@ -121,5 +122,18 @@ class OakSource:
         control.setManualExposure(timedelta(microseconds=s.exposure_us), s.iso)
         if s.trigger == "snapshot":
             control.setExternalTrigger(1, 0)
-        elif s.trigger == "continuous":
+        else:
             control.setFrameSyncMode(dai.CameraControl.FrameSyncMode.INPUT)
+
+
+def board_config(dai: Any, settings: OakSettings) -> Any:
+    """The board with its two groups of FSIN pins joined, where that is asked for.
+
+    OAK-FFC-4P from R6 on: GPIO 38 selects; earlier boards: GPIO 6 (public scripts; not tried on a board). Left alone
+    unless asked for: the board tells its revision only once it runs.
+    """
+    config = dai.Device.Config()
+    if settings.tie_groups:
+        gpio = dai.BoardConfig.GPIO
+        config.board.gpio[_TIE_GPIO] = gpio(gpio.OUTPUT, gpio.Level.HIGH)
+    return config

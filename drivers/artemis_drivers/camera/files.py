@@ -10,15 +10,15 @@ import cv2
 
 from artemis_drivers.base import DriverError
 from artemis_drivers.camera.frames import CameraFrame
-from artemis_drivers.camera.settings import FolderSettings
+from artemis_drivers.camera.settings import FilesSettings
 
 _FILES = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
 
 
-class FolderSource:
+class FilesSource:
     """FrameSource of files; ``device_ns`` is the time at which a photograph was due."""
 
-    def __init__(self, settings: FolderSettings) -> None:
+    def __init__(self, settings: FilesSettings) -> None:
         self.settings = settings
         self._pictures: Iterator[tuple[str, int, int, bytes]] = iter(())
         self._sequence = 0
@@ -42,7 +42,8 @@ class FolderSource:
             encoding, width, height, data = next(self._pictures)
         except StopIteration:
             raise OSError("no more pictures") from None
-        frame = CameraFrame(self._sequence, self._due_ns, 0, width, height, encoding, data)
+        exposure = self.settings.exposure_us * 1000
+        frame = CameraFrame(self._sequence, self._due_ns, exposure, width, height, encoding, data)
         self._sequence += 1
         self._due_ns += round(1e9 / self.settings.rate_hz)
         return frame
@@ -68,7 +69,7 @@ class FolderSource:
                 if picture is not None:
                     height, width = picture.shape[:2]
                     yield _FILES[file.suffix.lower()], width, height, file.read_bytes()
-            if not self.settings.loop:
+            if not self.settings.repeat:
                 return
 
     def _video(self, path: Path) -> Iterator[tuple[str, int, int, bytes]]:
@@ -82,8 +83,9 @@ class FolderSource:
                     if not read:
                         break
                     height, width = picture.shape[:2]
-                    yield "bgr8", width, height, picture.tobytes()
+                    quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.jpeg_quality]
+                    yield "jpeg", width, height, cv2.imencode(".jpg", picture, quality)[1].tobytes()
             finally:
                 video.release()
-            if not self.settings.loop:
+            if not self.settings.repeat:
                 return
