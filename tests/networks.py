@@ -90,8 +90,13 @@ def _class_logits(classes: int) -> tuple[np.ndarray, np.ndarray]:
     return GAIN * weight, np.full(len(weight), -GAIN / 2)
 
 
-def yolo_export(path: Path, size: int = 160, classes: int = 3, texts: bool = False, **more: Any) -> Path:
-    """The ordinary export: a candidate of 40 x 40 pixels every 20 pixels; ``texts`` adds an input [1, K, 3]."""
+def yolo_export(
+    path: Path, size: int = 160, classes: int = 3, texts: bool = False, told: bool = True, **more: Any
+) -> Path:
+    """The ordinary export: a candidate of 40 x 40 pixels every 20 pixels; ``texts`` adds an input [1, K, 3].
+
+    Without ``told`` the file does not say how many classes it has.
+    """
     step = 20
     side = size // step
     graph = Graph()
@@ -116,7 +121,7 @@ def yolo_export(path: Path, size: int = 160, classes: int = 3, texts: bool = Fal
     inputs: dict[str, list[Any]] = {"images": [1, 3, size, size]}
     if texts:
         inputs["texts"] = [1, None, 3]
-    rows = None if texts else 4 + classes + MASKS
+    rows = None if texts or not told else 4 + classes + MASKS
     outputs = {"output0": [1, rows, side * side], "output1": [1, MASKS, size // 4, size // 4]}
     return graph.save(path, inputs, outputs, **more)
 
@@ -143,14 +148,16 @@ def yolo_raw(path: Path, **more: Any) -> Path:
     return graph.save(path, {"images": [1, 3, None, None]}, outputs, **more)
 
 
-def semantic(path: Path, size: tuple[Any, Any] = (None, None), **more: Any) -> Path:
-    """Logits at a quarter of the size: background, car, person, bench."""
+def semantic(
+    path: Path, size: tuple[Any, Any] = (None, None), bias: float = 0.0, told: bool = True, **more: Any
+) -> Path:
+    """Logits at a quarter of the size: background, car, person, bench. ``told`` and the ``bias`` of background."""
     graph = Graph()
     weight = np.concatenate([np.zeros((1, 3)), GAIN * RGB])
-    bias = np.array([0.0, *np.full(3, -GAIN / 2)])
-    graph.mixed(graph.pooled("images", 4), weight, bias, "logits")
+    biases = np.array([bias, *np.full(3, -GAIN / 2)])
+    graph.mixed(graph.pooled("images", 4), weight, biases, "logits")
     cells = [side // 4 if side else None for side in size]
-    return graph.save(path, {"images": [1, 3, *size]}, {"logits": [1, 4, *cells]}, **more)
+    return graph.save(path, {"images": [1, 3, *size]}, {"logits": [1, 4 if told else None, *cells]}, **more)
 
 
 def image_encoder(path: Path, batch: int | None = None) -> Path:

@@ -123,6 +123,19 @@ def test_the_wrong_signature(registry: Registry, tmp_path: Path) -> None:
     assert "FastSAM has one" in refused(registry, model, kind="fastsam-clip")
 
 
+def test_what_shows_only_when_it_runs(registry: Registry, tmp_path: Path) -> None:
+    """Files that leave the number of classes open, and numbers that are none."""
+    model = networks.yolo_export(tmp_path / "y.onnx", told=False)
+    for names in (("a", "b"), tuple("abcdefghij")):
+        assert "3 classes" in refused(registry, model, classes=names)
+    model = networks.semantic(tmp_path / "s.onnx", told=False)
+    assert "4 classes" in refused(registry, model, classes=("a", "b"))
+    model = networks.semantic(tmp_path / "n.onnx", bias=float("nan"))
+    assert "gives values that are no numbers" in refused(registry, model, classes=tuple("abcd"))
+    model = networks.semantic(tmp_path / "f.onnx", (100, 100))  # the pooling leaves 25 x 25 cells
+    assert add(registry, model, classes=tuple("abcd")).outputs == {"logits": (1, 4, 25, 25)}
+
+
 def test_names(registry: Registry, tmp_path: Path) -> None:
     path = networks.semantic(tmp_path / "my model.onnx")
     four = ("a", "b", "c", "d")

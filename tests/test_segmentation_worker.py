@@ -17,9 +17,12 @@ from artemis_edge.frames import F64, U8, CameraImage, CameraModel
 from artemis_edge.segmentation.backend import Backend, Prompt, Status
 from artemis_edge.segmentation.engine import HereEngine, Job, ProcessEngine, Result, run_job
 from artemis_edge.segmentation.keyframes import Apart, KeyframeStore, is_new, read_keyframes, segment_all
-from artemis_edge.segmentation.manifest import Manifest
+from artemis_edge.segmentation.knowledge import Knowledge
+from artemis_edge.segmentation.live import LiveQuestions
+from artemis_edge.segmentation.manifest import Kind, Manifest, Part
 from artemis_edge.segmentation.opening import open_model
 from artemis_edge.segmentation.registry import STORE_VARIABLE, Addition, Registry, file_hash, open_by_name
+from artemis_edge.segmentation.resolve import understand
 from artemis_edge.segmentation.worker import (
     Handed,
     LatestWins,
@@ -152,6 +155,49 @@ def test_without_prompts_nothing_is_segmented(backend: Backend) -> None:
     worker: LatestWins[None] = LatestWins(SlowEngine(backend), ())
     worker.offer(image(0.0), None)
     assert not worker.engine.busy
+
+
+def test_questions_come_and_go(backend: Backend) -> None:
+    engine = SlowEngine(backend)
+    live: LiveQuestions[str] = LiveQuestions(backend, LatestWins(engine, ()))
+    live.offer(image(0.0), "nothing is asked yet")
+    assert live.add("red car").classes == ("car",)
+    assert live.add("person next to the bench").status is Status.MATCHED
+    assert live.add("giraffe").status is Status.UNSUPPORTED
+    assert live.names == {1: "car", 2: "person", 3: "bench"}
+    live.offer(image(0.1), "first")
+    assert live.remove("red car") == [1]
+    assert live.remove("giraffe") == []
+    assert live.add("benches").classes == ("bench",)
+    engine.done = 1
+    (seen,) = live.ready()  # it was made when the car was still asked for
+    assert seen.segmentation.dense.slots == (0, 2, 3)
+    expected = backend.segment(networks.photograph(), seen.prompts).dense
+    np.testing.assert_array_equal(seen.segmentation.dense.score[:, :, 1], expected.score[:, :, 2])
+    live.offer(image(0.2), "second")
+    engine.done = 1
+    (seen,) = live.ready()
+    assert [prompt.slot for prompt in seen.prompts] == [2, 3]
+    assert live.remove("person next to the bench") == [2]  # the bench is asked for still
+    with pytest.raises(InputError, match=r"is not among the questions asked \('benches'\)"):
+        live.remove("red car")
+
+
+def test_what_a_model_knows_is_told_by_its_manifest(backend: Backend, tmp_path: Path) -> None:
+    def said(kind: Kind, *classes: str, **parts: Part) -> Knowledge:
+        return Knowledge(
+            Manifest(name="m", kind=kind, file="f", sha256="0" * 64, licence="", classes=classes, parts=parts)
+        )
+
+    closed = said("semantic", "background", *networks.CLASSES)
+    for word in (*networks.CLASSES, "giraffe", "background", ""):
+        assert closed.support(word).status is backend.support(word).status
+    table = Part(file="t.npy", sha256="0" * 64)
+    assert said("openvocab-seg", "car", embeddings=table).support("giraffe").status is Status.UNSUPPORTED
+    assert said("openvocab-seg").support("giraffe").status is Status.MATCHED
+    assert said("fastsam-clip").support("giraffe").status is Status.MATCHED
+    assert said("attribute").support("car").status is Status.APPROXIMATE
+    assert understand("vehicles", said("yolo-seg", "motorbike", "lorry")).classes == ("truck", "motorcycle")
 
 
 # --- repeatable

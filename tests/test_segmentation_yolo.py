@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from artemis_edge.errors import InputError
 from artemis_edge.segmentation import yolo
 from artemis_edge.segmentation.backend import DenseScores, Grid
 from artemis_edge.segmentation.letterbox import Letterbox
@@ -86,6 +87,17 @@ def test_both_layouts_say_the_same() -> None:
     one, _ = yolo.candidates(outputs, [4, 1], 0.3)
     two, _ = yolo.candidates(ordinary, [4, 1], 0.3)
     np.testing.assert_allclose(as_rows(one), as_rows(two), atol=1e-3)
+
+
+def test_tensors_of_another_number_of_classes_are_refused() -> None:
+    outputs = heads(np.random.default_rng(2), classes=5)
+    yolo.check_classes(outputs, 5, "n")
+    with pytest.raises(InputError, match="the model n gives tensors of 5 classes, 4 are named"):
+        yolo.check_classes(outputs, 4, "n")
+    ordinary = {"a": np.zeros((1, 40, 7)), "b": np.zeros((1, 32, 4, 4))}
+    yolo.check_classes(ordinary, 4, "n")
+    with pytest.raises(InputError, match="gives tensors of no classes"):
+        yolo.check_classes({"a": np.zeros((1, 9, 7)), "b": np.zeros((1, 32, 4, 4))}, 4, "n")
 
 
 def slow_suppress(found: yolo.Candidates, overlap: float) -> list[int]:

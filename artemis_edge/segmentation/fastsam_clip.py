@@ -77,6 +77,7 @@ class FastSamClip:
         size, fixed = input_of(self._network, self._manifest)
         box = Letterbox.fit(image.shape[:2], size, fixed, self._manifest.stride, centred=True)
         outputs = self._network.run(box.fill(image, PAD, self._manifest.mean, self._manifest.std))
+        yolo.check_classes(outputs, 1, self.name)
         raw, protos = yolo.candidates(outputs, [0], _REGIONS.score)
         kept = yolo.suppress(raw, _REGIONS.overlap, _REGIONS.most)
         regions = instances(kept, protos, box, [_ANYTHING], [_ANYTHING.text])

@@ -51,17 +51,24 @@ class Network:
         self.metadata: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
 
     def run(self, *values: Array) -> dict[str, Array]:
-        """Outputs by name; ``values`` in the order of the inputs, converted to the types that they have."""
+        """Outputs by name; ``values`` in the order of the inputs, converted to the types that they have.
+
+        Raises InputError where the network cannot take them or gives values that are no numbers.
+        """
         feed = {}
         for (name, dtype), value in zip(self._dtypes.items(), values, strict=True):
             if dtype is None:
                 raise InputError(f"input '{name}' of {self.file} is of a type that is not known here")
             feed[name] = np.ascontiguousarray(value, dtype)
         try:
-            return dict(zip(self.outputs, self._session.run(None, feed), strict=True))
+            outputs = dict(zip(self.outputs, self._session.run(None, feed), strict=True))
         except Exception as error:  # as above
             first = str(error).splitlines()[0][:200]
             raise InputError(f"{self.file} does not run on this input: {first}") from None
+        with np.errstate(all="ignore"):  # a sum over everything is finite only if everything is
+            if not all(np.isfinite(np.sum(value, dtype=np.float64)) for value in outputs.values()):
+                raise InputError(f"{self.file} gives values that are no numbers; export it again")
+        return outputs
 
 
 def _shape(shape: Sequence[Any]) -> tuple[int | None, ...]:

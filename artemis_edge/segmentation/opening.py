@@ -154,7 +154,7 @@ class Smoke:
 
 
 def smoke_test(backend: Backend) -> Smoke:
-    """Two images of noise through a backend; raises InputError where it fails or gives no numbers."""
+    """Two images of noise through a backend; raises InputError where it fails."""
     words = [canonical(name) for name in backend.classes] or list(_SMOKE_WORDS)
     asked = [word for word in dict.fromkeys(words) if backend.support(word).status is Status.MATCHED][
         :MOST_SLOTS
@@ -163,11 +163,8 @@ def smoke_test(backend: Backend) -> Smoke:
     ms = 0.0
     for seed in range(2):
         start = time.process_time()
-        found = backend.segment(_noise(seed), prompts)
+        backend.segment(_noise(seed), prompts)
         ms = (time.process_time() - start) * 1e3
-        values = [instance.mask for instance in found.instances]
-        if not all(np.isfinite(mask).all() for mask in values):
-            raise InputError(f"the model {backend.name} gives values that are no numbers; export it again")
     return Smoke(ms, tuple(asked))
 
 

@@ -48,7 +48,9 @@ class OpenVocabulary:
         support = [self.support(prompt.text) for prompt in prompts]
         known = [p for p, s in zip(prompts, support, strict=True) if s.status is not Status.UNSUPPORTED]
         filled = box.fill(image, PAD, self._manifest.mean, self._manifest.std)
-        outputs = self._network.run(filled, self._rows([prompt.text for prompt in known]))
+        rows = self._rows([prompt.text for prompt in known])
+        outputs = self._network.run(filled, rows)
+        yolo.check_classes(outputs, rows.shape[-2], self.name)
         limits = self._thresholds
         raw, protos = yolo.candidates(outputs, range(len(known)), limits.score)
         kept = yolo.suppress(raw, limits.overlap, limits.most)

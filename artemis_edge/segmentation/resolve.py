@@ -4,11 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 from artemis_edge.errors import InputError
-from artemis_edge.segmentation.backend import MOST_SLOTS, Backend, Prompt, Status
+from artemis_edge.segmentation.backend import MOST_SLOTS, Prompt, Status, Support
 from artemis_edge.segmentation.query import Phrase, Query, parse
 from artemis_edge.segmentation.words import canonical, vocabulary
+
+
+class Knower(Protocol):
+    """A backend, or what is known of one."""
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+        ...
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Its base classes in its own words; empty where it takes any text."""
+        ...
+
+    def support(self, text: str) -> Support:
+        """Whether it can look for a base class."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +55,7 @@ class Understanding:
     reason: str = ""
 
 
-def resolve(noun: str, backend: Backend) -> Resolved:
+def resolve(noun: str, backend: Knower) -> Resolved:
     """The classes of a backend that a noun means: itself and what it covers, else what covers it (approximate)."""
     words = vocabulary()
     own = {canonical(name) for name in backend.classes}
@@ -54,7 +73,7 @@ def resolve(noun: str, backend: Backend) -> Resolved:
     return Resolved(noun, (), Status.UNSUPPORTED, direct.reason)
 
 
-def understand(text: str, backend: Backend) -> Understanding:
+def understand(text: str, backend: Knower) -> Understanding:
     """Parse a question and see what the backend can look for; never fails."""
     query = parse(text)
     if not query.targets:

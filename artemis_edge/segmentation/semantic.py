@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from artemis_edge.errors import InputError
 from artemis_edge.frames import F32, U8
 from artemis_edge.segmentation import scores
 from artemis_edge.segmentation.backend import (
@@ -70,6 +71,11 @@ class Semantic:
         box = Letterbox.fit(image.shape[:2], size, fixed, self._manifest.stride, centred=False)
         filled = box.fill(image, _PAD, self._manifest.mean, self._manifest.std)
         (logits,) = self._network.run(filled).values()
+        if logits.shape[1] != len(self.classes):
+            raise InputError(
+                f"the model {self.name} gives {logits.shape[1]} classes, {len(self.classes)} are named; "
+                "register it again with the names that it was trained with"
+            )
         rows, columns = box.cells(logits.shape[3], logits.shape[2])
         grid = box.grid(logits.shape[3], logits.shape[2]).cropped(columns.start, rows.start)
         view = _View(probabilities(logits[0, :, rows, columns]), grid, box)

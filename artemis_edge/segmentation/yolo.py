@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from artemis_edge.errors import InputError
 from artemis_edge.frames import F32, I64
 from artemis_edge.segmentation.network import Array
 
@@ -61,6 +62,16 @@ def class_count(outputs: Shapes) -> int | None:
     if rows is None:
         return 0
     return rows - _EDGES - MASKS if rows > _EDGES + MASKS else None
+
+
+def check_classes(outputs: Mapping[str, Array], classes: int, name: str) -> None:
+    """Raises InputError where tensors are not those of so many classes; a file may leave their shape open."""
+    found = class_count({key: value.shape for key, value in outputs.items()})
+    if found != classes:
+        raise InputError(
+            f"the model {name} gives tensors of {found if found is not None else 'no'} classes, {classes} are named; "
+            "register it again with the names that it was trained with"
+        )
 
 
 def is_raw(outputs: Mapping[str, object]) -> bool:

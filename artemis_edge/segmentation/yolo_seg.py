@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from artemis_edge.config import SegmentationConfig
 from artemis_edge.frames import F32, U8
 from artemis_edge.segmentation import scores, yolo
 from artemis_edge.segmentation.backend import Instance, Prompt, Segmentation, Status, Support
@@ -23,6 +24,11 @@ class Thresholds:
     score: float = 0.25
     overlap: float = 0.7
     most: int = 100
+
+    @classmethod
+    def by(cls, config: SegmentationConfig) -> Thresholds:
+        """As configured."""
+        return cls(config.least_score, config.overlap)
 
 
 def input_of(network: Network, manifest: Manifest) -> tuple[tuple[int, int], bool]:
@@ -87,6 +93,7 @@ class YoloSeg:
         known = [p for p, s in zip(prompts, support, strict=True) if s.status is not Status.UNSUPPORTED]
         columns = [self._column[prompt.text] for prompt in known]
         limits = self._thresholds
+        yolo.check_classes(outputs, len(self.classes), self.name)
         raw, protos = yolo.candidates(outputs, columns, limits.score)
         labels = [self.classes[column] for column in columns]
         found = instances(yolo.suppress(raw, limits.overlap, limits.most), protos, box, known, labels)
