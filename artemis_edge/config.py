@@ -231,11 +231,11 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
     sigma_photo: Annotated[
         float,
         _float("Colour difference that halves trust, about (eq. 9) [grey levels].", ge=0.1, le=1e6),
-    ] = 40.0
+    ] = 80.0
     sigma_geom: Annotated[
         float,
         _float("Distance in front of a surface that halves trust (eq. 9) [share of it].", ge=1e-4, le=1e6),
-    ] = 0.02
+    ] = 0.05
     least_reliability: Annotated[
         float, _float("Observations of less reliability W are discarded.", ge=0.001, le=0.999)
     ] = 0.1
@@ -254,7 +254,7 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
     least_cosine: Annotated[
         float,
         _float("Surfaces seen at a smaller cosine of the viewing angle are left alone.", ge=0.01, le=0.99),
-    ] = 0.04
+    ] = 0.03
     range_m: Annotated[
         float, _float("Surfaces farther than this are not coloured [m].", ge=1.0, le=1000.0)
     ] = 80.0
@@ -270,6 +270,9 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
     atlas_megatexels: Annotated[
         float, _float("Texels of the finished mesh's atlas at most [millions].", ge=0.1, le=4096.0)
     ] = 128.0
+    vignetting: Annotated[
+        bool, Meta(description="Whether the fall-off of lenses towards their corners is undone.")
+    ] = True
     share: Annotated[
         float, _float("Share of the surface in view that one image colours.", ge=0.01, le=1.0)
     ] = 1.0

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 import numpy as np
 
@@ -456,11 +456,27 @@ def block_keys(block: I32) -> I64:
     return _pack_ids(b[:, 0], b[:, 1], b[:, 2])
 
 
+class Companion(Protocol):
+    """What goes to disk and comes back with a block but is kept elsewhere (texels)."""
+
+    def load(self, geometry: float) -> float:
+        """Share of the memory in use, when the map itself uses the share ``geometry`` of it."""
+        ...
+
+    def leave(self, bx: int, by: int, bz: int) -> None:
+        """A block goes to disk."""
+        ...
+
+    def come_back(self, bx: int, by: int, bz: int) -> None:
+        """A block is in memory again."""
+        ...
+
+
 class Pager:
     """Keeps a store within its pools: the least recently seen blocks go to disk and come back when touched."""
 
-    def __init__(self, store: Store, folder: Path) -> None:
-        self._store = store
+    def __init__(self, store: Store, folder: Path, companion: Companion | None = None) -> None:
+        self._store, self._companion = store, companion
         self.file = PageFile(folder)
         self._slots = np.empty(store.block.shape[0], np.int32)
         self.paged_out = 0
@@ -507,6 +523,8 @@ class Pager:
             if not has_waiting(self._store, slot) and self._store.block[slot, CHANGED] == 0:
                 one = np.array([slot], np.int32)
                 self.file.put(int(slot_keys(self._store, one)[0]), pack(self._store, one))
+                if self._companion is not None:
+                    self._companion.leave(*self._store.block[slot, BX : BX + 3].tolist())
                 bs.remove_block(self._store, slot)
                 self.paged_out += 1
 
@@ -523,10 +541,10 @@ class Pager:
         compact_patches(self._store, voxels[order])
 
     def fill(self) -> float:
-        """Share of the fullest pool that is in use."""
+        """Share of the fullest pool that is in use, and of the memory that the companion shares with it."""
         c, s = self._store.counter, self._store
         free = (s.free_patches * (bs.SMALLEST_ROOM << np.arange(bs.PATCH_CLASSES))).sum()
-        return float(
+        fullest = float(
             max(
                 (c[bs.N_BLOCKS] - c[bs.FREE_BLOCKS]) / len(s.block),
                 (c[bs.N_VOXELS] - c[bs.FREE_VOXELS]) / len(s.voxel),
@@ -534,6 +552,7 @@ class Pager:
                 (c[bs.N_TRIANGLES] - free) / len(s.triangle),
             )
         )
+        return fullest if self._companion is None else self._companion.load(fullest)
 
     def pages(self) -> Iterator[Page]:
         """Every block of the map, resident or not, in order of keys; a page a block."""
@@ -559,4 +578,6 @@ class Pager:
             raise RunError(
                 "the memory budget is too small for what is in view; raise voxel_map.memory_budget_mb"
             )
+        if self._companion is not None:
+            self._companion.come_back(bx, by, bz)
         self.paged_in += 1

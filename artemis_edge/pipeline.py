@@ -32,14 +32,14 @@ class Pipeline:
         self.odometry = odometry
         self.voxel_map = VoxelMap(config.voxel_map, (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6)
         self.free_space = FreeSpace(config.voxel_map, self.voxel_map)
-        self.pager = Pager(self.voxel_map.store, page_folder)
-        self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.prepare)
         self.refinement = Refinement(
             config.refinement,
             self.voxel_map,
             (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6,
             page_folder,
         )
+        self.pager = Pager(self.voxel_map.store, page_folder, self.refinement.pages)
+        self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.prepare)
         self.outbox = Outbox(self.voxel_map.store)
         self.tracked: TrackedFrame | None = None
         self.trajectory: list[tuple[int, F64]] = []
@@ -103,6 +103,7 @@ class Pipeline:
         if self._mesh is not None:
             size += write_atlas(folder, self.refinement.atlas(self._mesh))
         self.pager.file.close()
+        self.refinement.close()
         return size
 
     def before_copy(self) -> None:

@@ -17,111 +17,138 @@ from artemis_edge.export.atlas import UNTEXTURED, Atlas, empty_atlas
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F32, F64, I32, I64, U8
 from artemis_edge.refinement.painting import load_triangle, row_span, set_edges
+from artemis_edge.refinement.texel_pages import TexelPages, blocks_around
 from artemis_edge.refinement.texels import AT, COARSEST, LEVEL, LEVELS, MEAN_SCALE, TexelStore, chart_near
 
 PADDING = 4  # pixels: two mip levels
 LARGEST_PAGE, SMALLEST_PAGE = 4096, 256
 # Texels around a face that its own colour is copied to: interpolation and the level above need them
 _WIDEN = 1.5
-_FULL_SHELF = 0.97
+_BLOCKS_AT_ONCE = 64  # whose texels are brought into memory together
 
 
 class Faces(NamedTuple):
-    """Where faces lie: ``chart`` int32 (m,) or -1, ``uv`` float64 (m, 3, 2) corners in voxels from the chart's corner,
-    ``plane`` float64 (m, 4): place a of the first corner and slopes of it along the chart's axes; direction.
+    """Where faces lie: ``key`` int64 (m,) of the chart or -1 and its ``level``, ``corner`` int64 (m, 2) the chart's
+    place b, c; ``uv`` float64 (m, 3, 2) corners in voxels from there, ``plane`` float64 (m, 4): the height a of the
+    first corner and its slopes along b and c [voxels], and the direction.
     """
 
-    chart: I32
+    key: I64
+    level: I32
+    corner: I64
     uv: F64
     plane: F64
 
 
-def build_atlas(mesh: Mesh, texels: TexelStore, voxel_m: float, most_texels: int) -> Atlas:
-    """Atlas of a mesh from the texture of its map; coarser where it would have more than ``most_texels``."""
+class Boxes(NamedTuple):
+    """Rectangles of the atlas, one a chart: ``first`` and ``last`` of its faces among ``face``; ``level``; ``start``
+    (g, 2) and ``size`` (g, 2) in texels from the chart's corner, padding included; ``at`` (g, 3) page, column, row.
+    """
+
+    face: I64
+    first: I64
+    last: I64
+    level: I32
+    start: I64
+    size: I64
+    at: I64
+
+
+def build_atlas(mesh: Mesh, texels: TexelStore, pages: TexelPages, voxel_m: float, most_texels: int) -> Atlas:
+    """Atlas of a mesh from the texture of its map; coarser where it would have more than ``most_texels``.
+
+    Texels on disk are brought into memory part by part.
+    """
     m = len(mesh.faces)
-    faces = Faces(np.full(m, -1, np.int32), np.empty((m, 3, 2)), np.empty((m, 4)))
-    corners = np.empty((m, 2), np.int64)
-    place_faces(texels, mesh.vertices, mesh.faces, voxel_m, np.empty((3, 3)), faces, corners)
-    used = np.flatnonzero(faces.chart >= 0)
-    if len(used) == 0:
+    faces = Faces(
+        np.full(m, -1, np.int64),
+        np.zeros(m, np.int32),
+        np.empty((m, 2), np.int64),
+        np.empty((m, 3, 2)),
+        np.empty((m, 4)),
+    )
+    parts = _parts(mesh, voxel_m, len(pages) > 0)
+    for rows, blocks in parts:
+        pages.need(blocks)
+        place_faces(texels, mesh.vertices, mesh.faces, rows, voxel_m, np.empty((3, 3)), faces)
+    if not (faces.key >= 0).any():
         return empty_atlas(m)
-    # by the chart's place in space, which does not depend on how memory was handed out
-    key = texels.key[faces.chart[used]]
-    used = used[np.argsort(key, kind="stable")]
-    chart, first = np.unique(texels.key[faces.chart[used]], return_index=True)
-    owner = faces.chart[used[first]]
-    del chart
-    group = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(used))))
-    level, box = _boxes(texels, faces, used, first, group, owner, most_texels)
-    return _draw(texels, faces, corners, used, first, level, box, m)
+    boxes, edge, count = _lay_out(faces, most_texels)
+    atlas = Atlas(
+        tuple(np.zeros((count, edge, edge, 3), np.uint8)),
+        np.full(m, UNTEXTURED, np.int32),
+        np.zeros((m, 3, 2), np.float32),
+        PADDING,
+    )
+    place = np.full(m, -1, np.int64)
+    place[boxes.face] = np.repeat(np.arange(len(boxes.first)), boxes.last - boxes.first)
+    for rows, blocks in parts:
+        pages.need(blocks)
+        mine = np.unique(place[rows])
+        _fill(texels, faces, boxes, mine[mine >= 0], atlas)
+    return atlas
 
 
-def _boxes(
-    texels: TexelStore, faces: Faces, used: I64, first: I64, group: I64, owner: I32, most_texels: int
-) -> tuple[I32, I64]:
-    """Level of each rectangle and its texels (g, 4): first column and row, width and height, padding included."""
-    low = np.minimum.reduceat(faces.uv[used].min(axis=1), first, axis=0)
-    high = np.maximum.reduceat(faces.uv[used].max(axis=1), first, axis=0)
-    del group
+def _parts(mesh: Mesh, voxel_m: float, in_parts: bool) -> list[tuple[I64, set[tuple[int, int, int]]]]:
+    """Faces by the blocks of their middles, and the blocks whose texels they may need: those and their neighbours."""
+    if not in_parts:
+        return [(np.arange(len(mesh.faces)), set())]
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    block = np.floor(middle / np.float32(8.0 * voxel_m)).astype(np.int64)
+    names, which = np.unique(block, axis=0, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    ends = np.searchsorted(which.ravel()[order], np.arange(len(names) + 1))
+    out = []
+    for first in range(0, len(names), _BLOCKS_AT_ONCE):
+        last = min(first + _BLOCKS_AT_ONCE, len(names))
+        near = blocks_around([(x, y, z) for x, y, z in names[first:last].tolist()])
+        out.append((order[ends[first] : ends[last]], near))
+    return out
+
+
+def _lay_out(faces: Faces, most_texels: int) -> tuple[Boxes, int, int]:
+    """Rectangles of all charts, the edge of the pages and how many there are.
+
+    In the order of the charts' places in space, which does not depend on how memory was handed out.
+    """
+    face = np.flatnonzero(faces.key >= 0)
+    face = face[np.argsort(faces.key[face], kind="stable")]
+    first = np.flatnonzero(np.diff(faces.key[face], prepend=-1))
+    low = np.minimum.reduceat(faces.uv[face].min(axis=1), first, axis=0)
+    high = np.maximum.reduceat(faces.uv[face].max(axis=1), first, axis=0)
     for finest in range(LEVELS - 1, -1, -1):
-        level = np.minimum(texels.chart[owner, LEVEL], finest)
+        level = np.minimum(faces.level[face[first]], finest)
         edge = (COARSEST << level)[:, None]
         start = np.floor(low * edge - 0.5).astype(np.int64) - PADDING
-        stop = np.ceil(high * edge - 0.5).astype(np.int64) + PADDING + 1
-        size = stop - start
+        size = np.ceil(high * edge - 0.5).astype(np.int64) + PADDING + 1 - start
         if size.prod(axis=1).sum() <= most_texels:
             break
-    return level.astype(np.int32), np.concatenate((start, size), axis=1)
-
-
-def _draw(
-    texels: TexelStore,
-    faces: Faces,
-    corners: I64,
-    used: I64,
-    first: I64,
-    level: I32,
-    box: I64,
-    m: int,
-) -> Atlas:
-    edge = _page_edge(box)
-    order = np.lexsort((np.arange(len(box)), -box[:, 2], -box[:, 3]))
-    place = np.empty((len(box), 3), np.int64)
-    count = pack_shelves(box[order, 2], box[order, 3], edge, place)
-    at = np.empty_like(place)
+    page_edge = _page_edge(size)
+    order = np.lexsort((-size[:, 0], -size[:, 1]))
+    place, at = np.empty((2, len(first), 3), np.int64)
+    count = pack_shelves(size[order, 0], size[order, 1], page_edge, place)
     at[order] = place
-    pages = np.zeros((count, edge, edge, 3), np.uint8)
-    last = np.append(first[1:], len(used))
-    scratch = np.empty((int((box[:, 2] * box[:, 3]).max()), 2), np.int32)
-    known = np.empty(int((box[:, 2] * box[:, 3]).max()), np.uint8)
-    page = np.full(m, UNTEXTURED, np.int32)
-    uv = np.zeros((m, 3, 2), np.float32)
-    fill_boxes(
-        texels,
-        faces,
-        corners,
-        used,
-        first,
-        last,
-        level,
-        box,
-        at,
-        pages,
-        page,
-        uv,
-        known,
-        scratch,
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-    )
-    return Atlas(tuple(pages), page, uv, PADDING)
+    last = np.append(first[1:], len(face))
+    return Boxes(face, first, last, level.astype(np.int32), start, size, at), page_edge, count
 
 
-def _page_edge(box: I64) -> int:
+def _fill(texels: TexelStore, faces: Faces, boxes: Boxes, mine: I64, atlas: Atlas) -> None:
+    """Draw the rectangles ``mine`` and set the corners of their faces."""
+    if len(mine) == 0:
+        return
+    room = int(boxes.size[mine].prod(axis=1).max())
+    known, queue = np.empty(room, np.uint8), np.empty((room, 2), np.int32)
+    P, E = np.empty((2, 3, 3))
+    for g in mine.tolist():
+        picture = atlas.pages[boxes.at[g, 0]]
+        fill_box(texels, faces, boxes, g, picture, atlas.page, atlas.uv, known, queue, P, E)
+
+
+def _page_edge(size: I64) -> int:
     """Edge of the square pages: the smallest power of two that may hold everything, within limits."""
-    area = float((box[:, 2] * box[:, 3]).sum()) / 0.85
+    area = float(size.prod(axis=1).sum()) / 0.85
     wanted = 1 << math.ceil(math.log2(max(math.sqrt(area), 1.0)))
-    least = 1 << math.ceil(math.log2(float(box[:, 2:].max())))
+    least = 1 << math.ceil(math.log2(float(size.max())))
     return max(min(wanted, LARGEST_PAGE), least, SMALLEST_PAGE)
 
 
@@ -146,20 +173,23 @@ def pack_shelves(width: I64, height: I64, edge: int, place: I64) -> int:
 
 @kernel
 def place_faces(
-    texels: TexelStore, vertices: F32, triangles: I32, voxel_m: float, P: F64, faces: Faces, corners: I64
+    texels: TexelStore, vertices: F32, triangles: I32, rows: I64, voxel_m: float, P: F64, faces: Faces
 ) -> None:
-    """The chart of each face's middle, and its corners there. ``corners`` (m, 2): the chart's place b, c."""
-    for t in range(triangles.shape[0]):
+    """The chart of each face's middle and the face's corners there, for the faces ``rows``; ``P`` is scratch."""
+    for t in rows:
         direction, along_b, along_c = load_triangle(
             vertices, triangles[t, 0], triangles[t, 1], triangles[t, 2], voxel_m, texels, P
         )
         if direction < 0:
             continue
-        middle_b, middle_c = (P[0, 0] + P[1, 0] + P[2, 0]) / 3.0, (P[0, 1] + P[1, 1] + P[2, 1]) / 3.0
         a = (P[0, 2] + P[1, 2] + P[2, 2]) / 3.0
-        b, c = math.floor(middle_b), math.floor(middle_c)
-        faces.chart[t] = chart_near(texels, direction, b, c, a)
-        corners[t, 0], corners[t, 1] = b, c
+        b = math.floor((P[0, 0] + P[1, 0] + P[2, 0]) / 3.0)
+        c = math.floor((P[0, 1] + P[1, 1] + P[2, 1]) / 3.0)
+        chart = chart_near(texels, direction, b, c, a)
+        if chart < 0:
+            continue
+        faces.key[t], faces.level[t] = texels.key[chart], texels.chart[chart, LEVEL]
+        faces.corner[t, 0], faces.corner[t, 1] = b, c
         for m in range(3):
             faces.uv[t, m, 0], faces.uv[t, m, 1] = P[m, 0] - b, P[m, 1] - c
         row = faces.plane[t]
@@ -167,43 +197,37 @@ def place_faces(
 
 
 @kernel
-def fill_boxes(
+def fill_box(
     texels: TexelStore,
     faces: Faces,
-    corners: I64,
-    used: I64,
-    first: I64,
-    last: I64,
-    level: I32,
-    box: I64,
-    at: I64,
-    pages: U8,
+    boxes: Boxes,
+    g: int,
+    picture: U8,
     page: I32,
     uv: F32,
     known: U8,
-    scratch: I32,
+    queue: I32,
     P: F64,
     E: F64,
 ) -> None:
-    """Draw every rectangle and set the corners of its faces."""
-    for g in range(first.shape[0]):
-        left, top, width, height = box[g, 0], box[g, 1], box[g, 2], box[g, 3]
-        picture = pages[at[g, 0], at[g, 2] : at[g, 2] + height, at[g, 1] : at[g, 1] + width]
-        for i in range(width * height):
-            known[i] = 0
-        total = 0
-        for k in range(first[g], last[g]):
-            total += _copy_face(texels, faces, used[k], corners, level[g], left, top, picture, known, P, E)
-        if total == 0:
-            continue
-        _spread(picture, known, scratch)
-        edge = COARSEST << level[g]
-        for k in range(first[g], last[g]):
-            t = used[k]
-            page[t] = at[g, 0]
-            for m in range(3):
-                uv[t, m, 0] = at[g, 1] + faces.uv[t, m, 0] * edge - 0.5 - left
-                uv[t, m, 1] = at[g, 2] + faces.uv[t, m, 1] * edge - 0.5 - top
+    """Draw rectangle ``g`` into its page and set the corners of its faces; the rest is scratch."""
+    left, top, width, height = boxes.start[g, 0], boxes.start[g, 1], boxes.size[g, 0], boxes.size[g, 1]
+    column, row = boxes.at[g, 1], boxes.at[g, 2]
+    part = picture[row : row + height, column : column + width]
+    known[: width * height] = 0
+    total = 0
+    for k in range(boxes.first[g], boxes.last[g]):
+        total += _copy_face(texels, faces, boxes.face[k], boxes.level[g], left, top, part, known, P, E)
+    if total == 0:
+        return
+    _spread(part, known, queue)
+    edge = COARSEST << boxes.level[g]
+    for k in range(boxes.first[g], boxes.last[g]):
+        t = boxes.face[k]
+        page[t] = boxes.at[g, 0]
+        for m in range(3):
+            uv[t, m, 0] = column + faces.uv[t, m, 0] * edge - 0.5 - left
+            uv[t, m, 1] = row + faces.uv[t, m, 1] * edge - 0.5 - top
 
 
 @kernel
@@ -211,7 +235,6 @@ def _copy_face(
     texels: TexelStore,
     faces: Faces,
     t: int,
-    corners: I64,
     level: int,
     left: int,
     top: int,
@@ -246,7 +269,7 @@ def _copy_face(
                 near_b, near_c = min(max(middle_b, b), b + 1.0), min(max(middle_c, c), c + 1.0)
                 a = plane[0] + plane[1] * (near_b - P[0, 0]) + plane[2] * (near_c - P[0, 1])
                 a = min(max(a, low_a), high_a)
-                chart = chart_near(texels, int(plane[3]), corners[t, 0] + b, corners[t, 1] + c, a)
+                chart = chart_near(texels, int(plane[3]), faces.corner[t, 0] + b, faces.corner[t, 1] + c, a)
             if chart < 0:
                 continue
             row, column = j - top, i - left

@@ -7,7 +7,7 @@ import numpy as np
 from artemis_edge._jit import kernel
 from artemis_edge.block_store import COLOUR, INFORMATION, Store
 from artemis_edge.frames import F32, F64
-from artemis_edge.refinement.reliability import Observations, Trust, exposure_weight, photometric
+from artemis_edge.refinement.reliability import Observations, Photo, Trust, exposure_weight, photometric
 
 # Vertices that an image must share with the map before their colours tell its exposure
 _LEAST_COMMON = 50
@@ -19,7 +19,7 @@ _DARK, _BRIGHT = 12.0, 245.0
 _LARGEST_GAIN = 8.0
 
 
-def estimate_gain(store: Store, seen: Observations, trust: Trust) -> F32:
+def estimate_gain(store: Store, seen: Observations, photo: Photo, trust: Trust) -> F32:
     """Factor per channel, float32 (3,), from the colours of an image as taken to those of the map.
 
     The median over the vertices both know: people who walk through and highlights do not move it. Ones where image
@@ -29,14 +29,22 @@ def estimate_gain(store: Store, seen: Observations, trust: Trust) -> F32:
     rows = np.flatnonzero(known & (seen.geometric > 0.5))
     mean = store.attribute[seen.slot[rows], COLOUR : COLOUR + 3]
     colour = seen.colour[rows]
+    shade = shades(photo, seen.pixel[rows])
     usable = ((colour > _DARK) & (colour < _BRIGHT) & (mean > _DARK) & (mean < _BRIGHT)).all(axis=1)
     if np.count_nonzero(usable) < _LEAST_COMMON:
         return np.ones(3, np.float32)
-    mean, colour = mean[usable], colour[usable]
+    mean, colour = mean[usable], (colour * shade[:, None])[usable]
     every = -(-len(mean) // _MOST_COMMON)
     gain: F64 = np.median(mean[::every] / colour[::every], axis=0)
     within: F32 = gain.clip(1.0 / _LARGEST_GAIN, _LARGEST_GAIN).astype(np.float32)
     return within
+
+
+def shades(photo: Photo, pixel: F32) -> F32:
+    """Factors that undo the lens's fall-off at pixels (n, 2), float32 (n,)."""
+    away = (pixel[:, 0] - photo.camera.cx) ** 2 + (pixel[:, 1] - photo.camera.cy) ** 2
+    steps = np.linspace(0.0, 1.0, len(photo.shade))
+    return np.interp(away * photo.inverse_r2, steps, photo.shade).astype(np.float32)
 
 
 @kernel

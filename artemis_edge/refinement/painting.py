@@ -12,6 +12,7 @@ from artemis_edge._jit import kernel
 from artemis_edge.frames import F32, F64
 from artemis_edge.refinement.camera import Camera, to_pixel
 from artemis_edge.refinement.reliability import (
+    CLIPPED,
     Photo,
     Trust,
     exposure_weight,
@@ -20,6 +21,7 @@ from artemis_edge.refinement.reliability import (
     photometric,
     reach_of,
     sample,
+    shade_at,
 )
 from artemis_edge.refinement.texels import (
     AT,
@@ -355,12 +357,16 @@ def _update(
 ) -> None:
     """Bayesian update of one texel's colour by the pixel at u, v, modulated by W."""
     r, k, b = sample(photo.image, u, v)
+    clipped = max(r, k, b) >= CLIPPED
     quality *= photo.sharpness * exposure_weight(r, k, b)
-    r, k, b = r * photo.gain[0], k * photo.gain[1], b * photo.gain[2]
+    f = shade_at(photo, u, v)
+    r, k, b = r * f * photo.gain[0], k * f * photo.gain[1], b * f * photo.gain[2]
     scale = 1.0 / MEAN_SCALE
     mr, mk, mb = texel[0] * scale, texel[1] * scale, texel[2] * scale
     information = texel[3] / INFORMATION_SCALE
     dr, dk, db = r - mr, k - mk, b - mb
+    if clipped and information > 0.0:  # at least that bright: no contradiction to what is brighter
+        dr, dk, db = max(dr, 0.0), max(dk, 0.0), max(db, 0.0)
     p = photometric(dr * dr + dk * dk + db * db, information, trust)
     w = g * p
     if w >= trust.least and quality > 0.0:

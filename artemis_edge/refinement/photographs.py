@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -96,7 +95,6 @@ class Keyframes:
     apart_rad: float = 0.15
     _kept: list[tuple[Waiting, int, int]] = field(default_factory=list)
     _last: dict[str, F64] = field(default_factory=dict)
-    _file: BinaryIO | None = None
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -106,11 +104,10 @@ class Keyframes:
         last = self._last.get(waiting.image.name)
         if self.most == 0 or (last is not None and self._is_near(last, waiting.T_world_cam)):
             return False
-        if self._file is None:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._file = (self.folder / "keyframes.bin").open("w+b")
-        at = self._file.seek(0, 2)
-        self._file.write(waiting.image.encoded)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with self._path.open("ab") as file:
+            at = file.tell()
+            file.write(waiting.image.encoded)
         bare = CameraImage(
             waiting.image.name,
             waiting.image.stamp_ns,
@@ -129,14 +126,15 @@ class Keyframes:
 
     def get(self, k: int) -> Waiting:
         """Keyframe ``k`` with its data."""
-        assert self._file is not None
         kept, at, size = self._kept[k]
-        self._file.seek(at)
+        with self._path.open("rb") as file:
+            file.seek(at)
+            encoded = file.read(size)
         image = kept.image
         whole = CameraImage(
             image.name,
             image.stamp_ns,
-            self._file.read(size),
+            encoded,
             image.model,
             image.T_cam_lidar,
             image.exposure_s,
@@ -144,12 +142,13 @@ class Keyframes:
         return Waiting(whole, kept.T_world_cam, kept.twist, kept.stamp)
 
     def close(self) -> None:
-        """Close and remove the file."""
-        if self._file is not None:
-            self._file.close()
-            (self.folder / "keyframes.bin").unlink(missing_ok=True)
-            self._file = None
-            self._kept = []
+        """Remove the file."""
+        self._path.unlink(missing_ok=True)
+        self._kept = []
+
+    @property
+    def _path(self) -> Path:
+        return self.folder / "colour_keyframes.bin"
 
     def _is_near(self, a: F64, b: F64) -> bool:
         turn = math.acos(min(max((float(np.trace(a[:3, :3].T @ b[:3, :3])) - 1.0) / 2.0, -1.0), 1.0))

@@ -27,7 +27,7 @@ _DEPTH_REACH = 1.5
 # Surfaces so steep that they change by more than this share of their distance within that reach hide themselves
 _STEEPEST = 0.3
 # Levels from which a channel is clipped, and below which a pixel is lost in the dark, with what they weigh then
-_CLIPPED, _CLIPPED_WEIGHT = 250.0, 0.1
+CLIPPED, _CLIPPED_WEIGHT = 250.0, 0.1
 _BLACK, _BLACK_WEIGHT = 4.0, 0.3
 
 
@@ -50,6 +50,10 @@ class Photo(NamedTuple):
     image: U8  # (h, w, 3) RGB
     depth: Depth
     gain: F32  # (3,) image to map
+    shade: (
+        F32  # factors that undo the lens's fall-off, over r^2 from the principal point to the farthest corner
+    )
+    inverse_r2: float  # 1 / r^2 of that corner [1 / pixels^2]
     sharpness: float  # weight by motion blur, 0..1
 
 
@@ -127,10 +131,20 @@ def sample(image: U8, u: float, v: float) -> tuple[float, float, float]:
 
 
 @kernel
+def shade_at(photo: Photo, u: float, v: float) -> float:
+    """Factor that undoes the lens's fall-off at a pixel."""
+    x, y = u - photo.camera.cx, v - photo.camera.cy
+    last = photo.shade.shape[0] - 1
+    at = min((x * x + y * y) * photo.inverse_r2, 1.0) * last
+    k = min(int(at), last - 1)
+    return float(photo.shade[k] + (at - k) * (photo.shade[k + 1] - photo.shade[k]))
+
+
+@kernel
 def exposure_weight(r: float, g: float, b: float) -> float:
     """How much a pixel tells by its level: a clipped channel tells only that it was at least that bright."""
     brightest = max(r, g, b)
-    if brightest >= _CLIPPED:
+    if brightest >= CLIPPED:
         return _CLIPPED_WEIGHT
     return _BLACK_WEIGHT if brightest <= _BLACK else 1.0
 
@@ -196,12 +210,14 @@ def observe_vertices(store: Store, visible: Visible, photo: Photo, trust: Trust,
 
 
 @kernel
-def weigh(store: Store, seen: Observations, gain: F32, trust: Trust) -> None:
-    """Apply the image's ``gain`` to the colours and fill ``reliability`` (eq. 9)."""
+def weigh(store: Store, seen: Observations, photo: Photo, trust: Trust) -> None:
+    """Bring the colours to the map's exposure and fill ``reliability`` (eq. 9)."""
+    gain = photo.gain
     coloured = store.attribute.shape[1] > INFORMATION
     for i in range(seen.slot.shape[0]):
         c, w = seen.colour[i], np.float64(seen.geometric[i])
-        c[0], c[1], c[2] = c[0] * gain[0], c[1] * gain[1], c[2] * gain[2]
+        f = shade_at(photo, seen.pixel[i, 0], seen.pixel[i, 1])
+        c[0], c[1], c[2] = c[0] * f * gain[0], c[1] * f * gain[1], c[2] * f * gain[2]
         if coloured:
             m = store.attribute[seen.slot[i]]
             dr, dg, db = c[0] - m[COLOUR], c[1] - m[COLOUR + 1], c[2] - m[COLOUR + 2]

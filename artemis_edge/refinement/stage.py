@@ -11,13 +11,15 @@ import numpy as np
 from artemis_edge.config import RefinementConfig
 from artemis_edge.export.atlas import Atlas
 from artemis_edge.export.mesh import Mesh
-from artemis_edge.frames import F64, CameraImage, TrackedFrame
+from artemis_edge.frames import F32, F64, CameraImage, TrackedFrame
 from artemis_edge.refinement import texels as tx
 from artemis_edge.refinement.atlas_builder import build_atlas
 from artemis_edge.refinement.colours import update_vertices
+from artemis_edge.refinement.exposure import Exposures
 from artemis_edge.refinement.painting import new_brush, paint
 from artemis_edge.refinement.photographs import Keyframes, Refused, Waiting, arrivals, decode
-from artemis_edge.refinement.reliability import Trust
+from artemis_edge.refinement.reliability import Trust, new_observations
+from artemis_edge.refinement.texel_pages import TexelPages
 from artemis_edge.refinement.view import Viewer
 from artemis_edge.voxel_map import VoxelMap
 
@@ -54,12 +56,14 @@ class Refinement:
         self.refused = Refused()
         self.keyframes = Keyframes(folder, config.keyframes)
         self.texels = tx.allocate(config.texel_share * budget_bytes)
+        self.pages = TexelPages(self.texels, folder, budget_bytes)
         self.trust = trust_of(config)
         self.viewer = Viewer(voxel_map.store, voxel_map.config.voxel_m, config.range_m, self.trust)
         self._config, self._map = config, voxel_map
         self._brush = new_brush(voxel_map.config.voxel_m, config.texel_px, config.finest_texel_m)
         self._waiting: deque[Waiting] = deque()
         self._looks = 0
+        self._shades: dict[str, F32] = {}
 
     def update(self, frame: TrackedFrame, stamp: int) -> None:
         """Take the images of a frame and use those whose turn has come."""
@@ -75,15 +79,22 @@ class Refinement:
         """Use all images that wait; then give what was meshed late its colour from the keyframes."""
         unseen = int(_LITTLE * tx.INFORMATION_SCALE)
         before = len(self.keyframes)
-        while self._waiting:
-            self._fuse(self._waiting.popleft(), _EVERYTHING)
+        gains = self._settle_exposures()
+        for waiting, gain in zip(self._waiting, gains, strict=True):
+            self._fuse(waiting, _EVERYTHING, gain)
+        self._waiting.clear()
         for k in range(before):
             self._fuse(self.keyframes.get(k), unseen)
 
     def atlas(self, mesh: Mesh) -> Atlas:
         """The texture of the finished mesh."""
         most = int(self._config.atlas_megatexels * 1e6)
-        return build_atlas(mesh, self.texels, self._map.config.voxel_m, most)
+        return build_atlas(mesh, self.texels, self.pages, self._map.config.voxel_m, most)
+
+    def close(self) -> None:
+        """Remove the files of this run."""
+        self.pages.close()
+        self.keyframes.close()
 
     @property
     def lost(self) -> Mapping[str, int]:
@@ -99,14 +110,30 @@ class Refinement:
             return False
         return self.viewer.unmeshed_share(waiting.image.model, waiting.T_world_cam) <= _UNMESHED
 
-    def _fuse(self, waiting: Waiting, enough: int) -> None:
+    def _settle_exposures(self) -> F32:
+        """Gains of all images that wait, (n, 3), at one go; and the lenses' fall-off."""
+        exposures = Exposures(self._config.vignetting)
+        refused = Refused()  # each is counted when it is fused
+        for waiting in self._waiting:
+            pixels = decode(waiting.image, refused)
+            model = waiting.image.model
+            seen = new_observations(0)
+            if pixels is not None:
+                seen = self.viewer.look(pixels, model, waiting.T_world_cam).seen
+            exposures.add(waiting.image.name, model, seen)
+        if len(exposures) == 0:
+            return np.empty((0, 3), np.float32)
+        gains, self._shades = exposures.solve()
+        return gains
+
+    def _fuse(self, waiting: Waiting, enough: int, gain: F32 | None = None) -> None:
         pixels = decode(waiting.image, self.refused)
         if pixels is None:
             return
         self._looks += 1
         model = waiting.image.model
         view = self.viewer.look(pixels, model, waiting.T_world_cam, sharpness(waiting.image, waiting.twist))
-        view = self.viewer.weigh(view)
+        view = self.viewer.weigh(view, gain, self._shades.get(waiting.image.name))
         store, voxel_m = self._map.store, self._map.config.voxel_m
         if enough == _EVERYTHING:
             spacing = model.fx * voxel_m / 4

@@ -175,6 +175,14 @@ def used_texels(texels: TexelStore) -> int:
     return n
 
 
+def chart_blocks(texels: TexelStore) -> set[tuple[int, int, int]]:
+    """Blocks that have charts in memory."""
+    key = texels.hash_key[texels.hash_key != EMPTY_KEY] >> 3
+    bias, mask = 1 << (_AXIS_BITS - 1), (1 << _AXIS_BITS) - 1
+    voxel = np.stack([((key >> (_AXIS_BITS * k)) & mask) - bias for k in (2, 1, 0)], axis=1)
+    return {(x, y, z) for x, y, z in np.unique(voxel >> 3, axis=0).tolist()}
+
+
 @kernel
 def place_key(direction: int, b: int, c: int, a: int) -> int:
     """Key of the chart with the index ``a`` along its axis and ``b``, ``c`` along the next two axes."""

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from artemis_edge.block_store import Store
-from artemis_edge.frames import F64, U8, CameraModel
+from artemis_edge.frames import F32, F64, U8, CameraModel
 from artemis_edge.refinement.camera import Camera, make_camera, view_bounds
 from artemis_edge.refinement.colours import estimate_gain
+from artemis_edge.refinement.exposure import SHADES, corner_radius2
 from artemis_edge.refinement.reliability import Observations, Photo, Trust, observe, weigh
 from artemis_edge.refinement.visible import Visible, depth_map, list_visible, new_visible, unmeshed
 
+_ONES = np.ones(SHADES, np.float32)
 _DEPTH_WIDTH = 320  # pixels of the reference depth map, about: finer ones lose nothing that matters
 
 
@@ -45,15 +47,23 @@ class Viewer:
         camera = self._camera(model, T_world_cam)
         self._visible = list_visible(self._store, camera, self._voxel_m, self._far_m, self._visible)
         depth = depth_map(self._visible, camera, max(round(model.width / _DEPTH_WIDTH), 1))
-        photo = Photo(camera, image, depth, np.ones(3, np.float32), sharpness)
+        photo = Photo(camera, image, depth, _ONES[:3], _ONES, 1.0 / corner_radius2(model), sharpness)
         seen = observe(self._store, self._visible, photo, self.trust)
         return View(self._visible, photo, seen)
 
-    def weigh(self, view: View) -> View:
-        """Bring the image to the map's exposure and fill W (eq. 9)."""
-        gain = estimate_gain(self._store, view.seen, self.trust)
-        weigh(self._store, view.seen, gain, self.trust)
-        return View(view.visible, view.photo._replace(gain=gain), view.seen)
+    def weigh(self, view: View, gain: F32 | None = None, shade: F32 | None = None) -> View:
+        """Bring the image to the map's exposure and fill W (eq. 9).
+
+        ``gain`` (3,) is estimated from the map where it is not given; ``shade`` is a table of ``exposure.SHADES``.
+        """
+        photo = view.photo
+        if shade is not None:
+            photo = photo._replace(shade=shade)
+        photo = photo._replace(
+            gain=estimate_gain(self._store, view.seen, photo, self.trust) if gain is None else gain
+        )
+        weigh(self._store, view.seen, photo, self.trust)
+        return View(view.visible, photo, view.seen)
 
     def _camera(self, model: CameraModel, T_world_cam: F64) -> Camera:
         if model not in self._bounds:
