@@ -101,7 +101,8 @@ class Pipeline:
         """Write what reopens the map; returns its size in bytes."""
         size = save_map(folder, self.pager, self.config)
         if self._mesh is not None:
-            size += write_atlas(folder, self.refinement.atlas(self._mesh))
+            atlas = self.refinement.atlas(self._mesh)
+            size += write_atlas(folder, atlas) if atlas.pages else 0
         self.pager.file.close()
         self.refinement.close()
         return size

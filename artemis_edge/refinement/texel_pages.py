@@ -49,7 +49,8 @@ class TexelPages:
     """Keeps the texels of blocks that are not in memory in an append-only file."""
 
     def __init__(self, texels: TexelStore, folder: Path, budget_bytes: float) -> None:
-        self._texels, self._path, self._budget = texels, folder / "texels.bin", budget_bytes
+        self._texels, self._path = texels, folder / "texels.bin"
+        self._budget = max(budget_bytes, float(texels.texel.nbytes))
         self._place: dict[tuple[int, int, int], tuple[int, int]] = {}
         self._charts = np.empty(_MOST, np.int32)
 
