@@ -4,10 +4,11 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 OUT    ?= demo-out
+LEARNT ?= train-out
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint bench soak viewer-test clean
+.PHONY: help setup demo test lint bench soak viewer-test train clean
 
 help:
 	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
@@ -16,6 +17,7 @@ help:
 	@echo "make bench   what a frame costs on this machine"
 	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
 	@echo "make viewer-test  exported GLB in three.js (fetches it with npm) in headless Chromium"
+	@echo "make train   render views of the virtual worlds, train and export the shipped network (an hour or two, torch)"
 	@echo "make setup   only create $(VENV); every target does it when needed"
 	@echo "make clean   remove $(VENV) and everything that was generated"
 
@@ -52,6 +54,17 @@ viewer-test: $(READY)
 	@cd tests/viewer && npm install --no-audit --no-fund --no-package-lock --silent
 	@$(BIN)/python -m pytest tests/viewer
 
+# Seeds: learnt from, calibrated with, judged by. Worlds that are used otherwise have seeds far below these.
+train: $(READY)
+	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install -qq --only-binary :all: -e '.[dev,train]'
+	@$(BIN)/python training/views.py --out $(LEARNT)/learn --seeds 10000:10024 --views 20
+	@$(BIN)/python training/views.py --out $(LEARNT)/calibrate --seeds 20000:20001 --views 16
+	@$(BIN)/python training/views.py --out $(LEARNT)/judge --seeds 20001:20005 --views 16
+	@$(BIN)/python training/train.py --views $(LEARNT)/learn --check $(LEARNT)/calibrate --out $(LEARNT)/weights.pt
+	@$(BIN)/python training/export.py --weights $(LEARNT)/weights.pt --calibrate $(LEARNT)/calibrate \
+	  --out artemis_edge/segmentation/shipped
+	@$(BIN)/python training/score.py --views $(LEARNT)/judge
+
 clean:
-	@rm -rf $(VENV) $(OUT) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) $(OUT) $(LEARNT) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,157 @@
+"""Trains the network on rendered views and writes its weights.
+
+    python training/train.py --views VIEWS --check OTHER_VIEWS --out WEIGHTS.pt [--steps N] [--seed N]
+        [--start WEIGHTS.pt] [--sought SHARE]
+
+One thread; equal arguments and views, equal weights on equal machines. The weights so far are written now and
+then, so that a long training can be looked at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from labels import IGNORED, NETWORK_CLASSES
+from network import Network
+from numpy.typing import NDArray
+from samples import Views, batch, whole
+from torch import Tensor, nn
+from torch.nn import functional
+
+_BATCH = 8
+_RATE, _DECAY = 3e-3, 0.02  # AdamW's learning rate at its highest, and weight decay
+_WARM_UP = 0.05  # of all steps
+_AVERAGED = 0.99  # the weights kept are a running mean of those learnt
+_RARE = 0.3  # power of a class's share of pixels by which it weighs less
+_REPORT_EVERY, _WRITE_EVERY = 50, 250
+
+
+def class_weights(shares: NDArray[np.float64]) -> Tensor:
+    """float32 (classes,): rare classes weigh more, 0.6 to 3; those not there nothing."""
+    weight = np.clip((np.maximum(shares, 1e-9) / 0.05) ** -_RARE, 0.6, 3.0)
+    return torch.from_numpy(np.where(shares > 0, weight, 0.0).astype(np.float32))
+
+
+def loss_of(logits: Tensor, label: Tensor, weights: Tensor) -> Tensor:
+    """Cross entropy, weighted by class; ``label`` int64 (n, h, w) of the cells of the logits."""
+    return functional.cross_entropy(logits, label, weights, ignore_index=IGNORED)
+
+
+def epochs(count: int, rng: np.random.Generator) -> Iterator[int]:
+    """All views in random order, again and again."""
+    while True:
+        yield from rng.permutation(count).tolist()
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How long and from where to learn; ``sought`` is the share of crops that look for a class."""
+
+    steps: int
+    seed: int
+    sought: float
+    start: Path | None
+
+
+def train(views: Views, how: Plan, out: Path) -> Network:
+    """The network after ``how.steps`` batches; its weights are written to ``out``."""
+    steps, seed = how.steps, how.seed
+    torch.manual_seed(seed)
+    rng = np.random.default_rng([seed, 91])
+    network = Network(len(NETWORK_CLASSES)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if how.start is not None:
+        network.load_state_dict(torch.load(how.start))
+    weights = class_weights(views.shares(len(NETWORK_CLASSES)))
+    mean = torch.optim.swa_utils.AveragedModel(
+        network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(_AVERAGED), use_buffers=True
+    )
+    optimiser = torch.optim.AdamW(_groups(network), lr=_RATE)
+    plan = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, _RATE, total_steps=steps, pct_start=_WARM_UP, cycle_momentum=False
+    )
+    order, began, total = epochs(len(views), rng), time.process_time(), 0.0
+    network.train()
+    for step in range(steps):
+        picture, label = batch(views, rng, [next(order) for _ in range(_BATCH)], how.sought)
+        down, right = rng.integers(0, 2, 2)  # each logit stands for four pixels, which teach it in turns
+        taught = torch.from_numpy(label[:, down::2, right::2].astype(np.int64))
+        pictures = torch.from_numpy(picture).contiguous(memory_format=torch.channels_last)
+        loss = loss_of(network(pictures), taught, weights)
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 2.0)
+        optimiser.step()
+        plan.step()
+        mean.update_parameters(network)
+        total += float(loss.detach())
+        if (step + 1) % _REPORT_EVERY == 0:
+            spent = time.process_time() - began
+            print(f"{step + 1}/{steps}: loss {total / _REPORT_EVERY:.4f}, {spent:.0f} s CPU", flush=True)
+            total = 0.0
+        if (step + 1) % _WRITE_EVERY == 0 or step + 1 == steps:
+            torch.save(mean.module.state_dict(), out)
+    learnt = mean.module
+    assert isinstance(learnt, Network)
+    return learnt.eval()
+
+
+def _groups(network: Network) -> list[dict[str, object]]:
+    """Only the weights of convolutions decay."""
+    decaying = [p for p in network.parameters() if p.ndim > 1]
+    others = [p for p in network.parameters() if p.ndim <= 1]
+    return [{"params": decaying, "weight_decay": _DECAY}, {"params": others, "weight_decay": 0.0}]
+
+
+def confusion(network: Network, views: Views) -> NDArray[np.int64]:
+    """Pixels (true class, class found) of whole views."""
+    count = len(NETWORK_CLASSES)
+    out = np.zeros((count, count), np.int64)
+    with torch.inference_mode():
+        for photo, label in zip(views.photos, views.labels, strict=True):
+            cells = network(torch.from_numpy(whole(photo)))[0].argmax(dim=0).numpy().astype(np.uint8)
+            found = cv2.resize(cells, label.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            known = label != IGNORED
+            pairs = label[known].astype(np.int64) * count + found[known]
+            out += np.bincount(pairs, minlength=count * count).reshape(count, count)
+    return out
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train, say how good it is on the views kept apart, write the weights."""
+    parser = argparse.ArgumentParser(prog="python training/train.py")
+    parser.add_argument("--views", type=Path, required=True)
+    parser.add_argument("--check", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--steps", type=int, default=2400)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--start", type=Path, help="weights to go on from")
+    parser.add_argument("--sought", type=float, default=0.7, help="share of crops that look for a class")
+    given = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    views = Views(list(given.views.glob("*.npz")))
+    print(f"{len(views)} views", flush=True)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    network = train(views, Plan(given.steps, given.seed, given.sought, given.start), given.out)
+    for world in sorted({p.name.split("-")[0] for p in given.check.glob("*.npz")}):
+        table = confusion(network, Views(list(given.check.glob(f"{world}-*.npz"))))
+        there = table.sum(axis=1) > 0
+        iou = np.diag(table) / np.maximum(table.sum(axis=0) + table.sum(axis=1) - np.diag(table), 1)
+        said = ", ".join(
+            f"{name} {value:.3f}"
+            for name, value, is_there in zip(NETWORK_CLASSES, iou, there, strict=True)
+            if is_there
+        )
+        print(f"{world}: mean {iou[there].mean():.3f}; {said}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
