@@ -286,6 +286,8 @@ def test_a_process_of_its_own(registered: str) -> None:
             time.sleep(0.01)
             assert worker.ready() == []
         assert "the segmentation process ended" in worker.fault
+        with pytest.raises(RunError, match="exit code -9"):
+            engine.fetch(wait=True)  # and never waits for what cannot come
     finally:
         engine.close()
 

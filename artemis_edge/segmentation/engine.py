@@ -1,15 +1,15 @@
 """Where images are segmented: in a process of its own (live and in the field), or here (tests, small tools).
 
-One image at a time. Nothing here waits unless it is asked to: a job is handed over only to an engine that is idle,
-which stands ready to take it, so that the hand-over of a photograph costs its copy and no more.
+One image at a time. Nothing here waits unless it is asked to.
 """
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
+import queue
 import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -105,7 +105,11 @@ class HereEngine:
 
 
 class ProcessEngine:
-    """A process with the network, joined by a pipe. A crash of it costs masks, nothing else."""
+    """A process with the network, joined by a pipe. A crash of it costs masks, nothing else.
+
+    A thread carries jobs and results over the pipe: a photograph is larger than the pipe's buffer, and the process
+    at the other end may have to wait for its turn on the CPU. The thread sleeps in system calls; the caller never does.
+    """
 
     def __init__(self, opener: Callable[[], Backend]) -> None:
         """``opener`` makes the backend, in the process; it is a function that can be pickled."""
@@ -116,13 +120,17 @@ class ProcessEngine:
         )
         self._process.start()
         theirs.close()
-        self._busy = False
-        self._starting = True
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[Result | str | RunError] = queue.SimpleQueue()
+        self._busy = self._starting = True
+        self._fault: RunError | None = None
+        self._carrier = threading.Thread(target=self._carry, name="segmentation pipe", daemon=True)
+        self._carrier.start()
 
     @property
     def busy(self) -> bool:
         """Whether it starts, a job is under way or its result was not fetched yet."""
-        return self._busy or self._starting
+        return self._busy
 
     @property
     def process_id(self) -> int:
@@ -131,57 +139,68 @@ class ProcessEngine:
 
     def wait_until_ready(self) -> None:
         """Wait for the network to be loaded; raises RunError with its sentence where it cannot be."""
-        if not self._starting:
-            return
-        if not self._pipe.poll(_START_S):
-            raise RunError(f"the segmentation process did not start within {_START_S:.0f} s; try again")
-        fault = self._receive()
-        self._starting = False
-        if isinstance(fault, str) and fault:
-            raise RunError(fault)
+        try:
+            self._take(self._results.get(timeout=_START_S) if self._starting else "")
+        except queue.Empty:
+            raise RunError(
+                f"the segmentation process did not start within {_START_S:.0f} s; try again"
+            ) from None
 
     def submit(self, job: Job) -> None:
-        """Send the job; the process stands in its receive call and takes it."""
-        try:
-            self._pipe.send(job)
-            self._busy = True
-        except OSError:
-            raise self._gone() from None
+        """Hand over a job; only when not busy."""
+        self._busy = True
+        self._jobs.put(job)
 
     def fetch(self, wait: bool) -> Result | None:
-        """The result, if it is there or ``wait``; None while it starts."""
-        if self._starting:
-            if wait or self._pipe.poll():
-                self.wait_until_ready()
+        """The result, if it is there or ``wait``; None while it starts, or where nothing is under way."""
+        if self._fault is not None:
+            raise self._fault
+        if not self._busy:
             return None
-        if not self._busy or not (wait or self._pipe.poll()):
+        try:
+            return self._take(self._results.get(block=wait))
+        except queue.Empty:
             return None
-        result = self._receive()
-        self._busy = False
-        return result if isinstance(result, Result) else None
 
     def close(self) -> None:
         """Ask the process to end, and end it where it does not."""
-        with contextlib.suppress(OSError):
-            self._pipe.send(None)
+        self._jobs.put(None)
         self._process.join(0.0 if self._busy else _STOP_S)
         if self._process.is_alive():
             self._process.terminate()
             self._process.join(_STOP_S)
+        self._carrier.join(_STOP_S)
         self._pipe.close()
 
-    def _receive(self) -> object:
-        try:
-            return self._pipe.recv()
-        except (EOFError, OSError):
-            raise self._gone() from None
+    def _take(self, item: Result | str | RunError) -> Result | None:
+        """A result; the word that it has started, with a sentence where it could not; or the fault that ended it."""
+        if isinstance(item, RunError):
+            self._fault = item
+            raise item
+        self._busy = False
+        if isinstance(item, Result):
+            return item
+        self._starting = False
+        if item:
+            raise RunError(item)
+        return None
 
-    def _gone(self) -> RunError:
-        self._process.join(_STOP_S)
-        code = self._process.exitcode
-        return RunError(
-            f"the segmentation process ended (exit code {code}); the map goes on without new masks"
-        )
+    def _carry(self) -> None:
+        """The life of the thread."""
+        try:
+            self._results.put(self._pipe.recv())
+            while (job := self._jobs.get()) is not None:
+                self._pipe.send(job)
+                self._results.put(self._pipe.recv())
+            self._pipe.send(None)
+        except (EOFError, OSError):
+            self._process.join(_STOP_S)
+            code = self._process.exitcode
+            self._results.put(
+                RunError(
+                    f"the segmentation process ended (exit code {code}); the map goes on without new masks"
+                )
+            )
 
 
 def _serve(pipe: Connection, opener: Callable[[], Backend]) -> None:
