@@ -7,12 +7,33 @@ import os
 import sys
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from artemis_edge.commands.common import DONE, FELL_SHORT, command
 from artemis_edge.errors import InputError
 
 if TYPE_CHECKING:
     from artemis_edge.tui.remote import Remote
+
+
+def add(commands: Any) -> None:
+    """Declare ``tui``."""
+    parser = command(commands, "tui", run_attach, "watch and steer the service from a terminal")
+    parser.add_argument(
+        "--socket",
+        type=Path,
+        metavar="PATH",
+        help="control socket of the service (default: where run puts it)",
+    )
+
+
+def run_attach(given: argparse.Namespace) -> int:
+    """``artemis-edge tui``."""
+    from artemis_edge.service.control import default_path
+    from artemis_edge.tui.socket_remote import SocketRemote
+
+    run_app(SocketRemote(given.socket or default_path()), Path())
+    return DONE
 
 
 def run_app(remote: Remote, sessions: Path) -> None:
@@ -57,7 +78,6 @@ def _has_colour() -> bool:
 
 def run_demo(given: argparse.Namespace, seed: int) -> int:
     """``artemis-edge demo --tui``."""
-    from artemis_edge.commands.common import DONE, FELL_SHORT
     from artemis_edge.session.results import prepare
     from artemis_edge.tui.child import DemoRemote
 

@@ -134,6 +134,10 @@ class Teller:
         self._newest.add(delta)
         self._times.append(ms)
 
+    def news(self, delta: MeshDelta) -> None:
+        """What changed outside a frame."""
+        self._newest.add(delta)
+
     def close(self) -> None:
         """Send what is left."""
         self._closing.set()
@@ -189,6 +193,13 @@ class WatchedPipeline(Pipeline):
         self._tell(frame)
         return delta
 
+    def finish(self) -> MeshDelta:
+        """The walk is over: what was postponed is done, and everything is saved."""
+        self._teller.say(state="saving", message="the walk is over; the map is being saved and measured")
+        delta = super().finish()
+        self._teller.news(delta)
+        return delta
+
     def _tell(self, frame: SyncedFrame) -> None:
         T = self.trajectory[-1][1]
         points = sum(len(scan.points) for scan in frame.scans)
@@ -240,7 +251,8 @@ def _demo(teller: Teller, world: str, seconds: float, seed: int, out: Path) -> N
     @contextlib.contextmanager
     def report(label: str) -> Iterator[Report]:
         def tell(done: int, total: int, note: str = "") -> None:
-            teller.say(message=f"{label}: {done} of {total}", frames_total=total)
+            if label != "mapping":  # of that the pipeline itself tells
+                teller.say(message=f"{label}: {done} of {total}", frames_total=total)
 
         yield tell
 
