@@ -104,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         run.add,
         models.add,
         rig.add,
+        tui.add,
     ):
         add(commands)
     return parser

@@ -1,9 +1,12 @@
 """The terminal: pages by pilot, pictures by hand, and a whole session against a remote that is told what to say."""
 
 import asyncio
+import threading
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from textual.pilot import Pilot
@@ -20,6 +23,7 @@ from artemis_edge.tui.history import History
 from artemis_edge.tui.pages import recordings
 from artemis_edge.tui.picture import SKY, MapCopy, draw, luminance_text
 from artemis_edge.tui.remote import RemoteError
+from artemis_edge.tui.socket_remote import SocketRemote
 from artemis_edge.tui.widgets import MeshPicture, advice, frame_times, gauges
 
 FULL = Status(
@@ -354,3 +358,61 @@ def test_recordings_are_found_newest_first(tmp_path: Path) -> None:
         os.utime(tmp_path / name, (k, k))
     assert [p.name for p, _ in recordings(tmp_path)] == ["three.mcap", "b", "a"]
     assert recordings(tmp_path / "nothing") == []
+
+
+class Service:
+    """A control socket in a thread, which answers as the service does."""
+
+    def __init__(self, path: Path) -> None:
+        from artemis_edge.service.control import ControlSocket
+
+        self.asked: list[dict[str, Any]] = []
+        self.control = ControlSocket(path, 0o600, self._answer)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _answer(self, what: str, request: dict[str, Any]) -> dict[str, Any]:
+        self.asked.append(request)
+        if what == "status":
+            return dict(msgspec.to_builtins(FULL))
+        if what == "mark":
+            return {"number": 3}
+        if what == "start":
+            raise InputError("the service is recording: wait until it is idle")
+        return {"phase": "saving"}
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            self.control.turn(dict, 0.02)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.control.close()
+
+
+def test_the_service_is_asked_over_its_socket(tmp_path: Path) -> None:
+    path = tmp_path / "artemis.sock"
+    remote = SocketRemote(path)
+    with pytest.raises(RemoteError, match="start it with: artemis-edge run"):
+        remote.status()
+    service = Service(path)
+    try:
+        assert remote.status() == FULL
+        assert remote.command("mark") == "marked, number 3"
+        assert remote.command("stop") == "the service is saving"
+        with pytest.raises(RemoteError, match="wait until it is idle"):
+            remote.command("start")
+        assert remote.ask("red car") == "looking for 'red car'"
+        assert service.asked[-1]["text"] == "red car"
+    finally:
+        service.close()
+    with pytest.raises(RemoteError):
+        remote.status()
+    again = Service(path)
+    try:
+        assert remote.status() == FULL, "it connects again by itself"
+    finally:
+        again.close()
+        remote.close()

@@ -8,16 +8,14 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from artemis_edge.frames import MeshDelta
-from artemis_edge.status import MapStatus, QueryStatus, State, Status, Stream, SyncStatus
+from artemis_edge.status import Status
 from artemis_edge.tui.remote import RemoteError
 
 _ANSWER_S = 3.0
 _MOST_ANSWER = 1 << 22
-_EXPECTED_HZ = {"lidar": 0.0, "cam": 10.0}
-_STATES: dict[str, State] = {
-    "idle": "idle", "checking": "checking", "recording": "recording", "saving": "saving", "fault": "fault",
-}  # fmt: skip
 
 
 class SocketRemote:
@@ -33,7 +31,10 @@ class SocketRemote:
 
     def status(self) -> Status:
         """The state as the service tells it."""
-        return to_status(self._ask({"do": "status"}))
+        try:
+            return msgspec.convert(self._ask({"do": "status"}), Status)
+        except msgspec.ValidationError:
+            raise RemoteError("the service is of another version; update the older of the two") from None
 
     def deltas(self) -> list[MeshDelta]:
         """The control socket carries no mesh."""
@@ -109,76 +110,3 @@ def _sentence(path: Path, error: OSError | ValueError) -> str:
     if isinstance(error, TimeoutError):
         return f"the service at {path} does not answer; see its journal"
     return f"the connection to {path} broke ({error}); trying again"
-
-
-def to_status(state: dict[str, Any]) -> Status:
-    """The service's state as a Status; what it does not tell stays unknown."""
-    session = state.get("session") or {}
-    mapping = session.get("mapping") or {}
-    devices = state.get("devices") or []
-    lost = {str(k): int(v) for k, v in (state.get("lost") or {}).items() if v}
-    lost |= {f"mapping_{k}": int(v) for k, v in (mapping.get("lost") or {}).items() if v}
-    ended = state.get("ended") or []
-    folder = str(session.get("folder") or (ended[-1].get("folder", "") if ended else ""))
-    report = Path(folder) / "map" / "report.html" if folder else None
-    events = [e.get("message") for e in state.get("events") or [] if e.get("message")]
-    return Status(
-        state=_STATES.get(str(state.get("phase")), "idle"),
-        message=str(state.get("fault") or (events[-1] if events else "")),
-        seconds=float(session.get("seconds") or 0.0),
-        session=folder,
-        frames=int(mapping.get("frames") or 0),
-        dropped=int(mapping.get("dropped") or 0),
-        streams=[_stream(d, session) for d in devices],
-        sync=_sync(state),
-        map=MapStatus(
-            int(mapping.get("vertices") or 0), int(mapping.get("triangles") or 0),
-            float(mapping.get("area_m2") or 0.0), float(mapping.get("resident_mb") or 0.0),
-        ),
-        frame_ms=[float(v) for v in mapping.get("frame_ms") or []],
-        disk_minutes=(state.get("disk") or {}).get("minutes_left"),
-        battery_minutes=(state.get("battery") or {}).get("minutes_left"),
-        overload=[str(v) for v in mapping.get("overload") or []],
-        degenerate=bool(mapping.get("degenerate")),
-        coaching=[str(v) for v in mapping.get("coaching") or []],
-        losses=lost,
-        queries=[_query(q) for q in mapping.get("queries") or state.get("queries") or []],
-        position=tuple((mapping.get("position") or (0.0, 0.0, 0.0))[:3]),
-        yaw=float(mapping.get("yaw") or 0.0),
-        report=str(report) if report is not None and report.exists() else "",
-    )  # fmt: skip
-
-
-def _stream(device: dict[str, Any], session: dict[str, Any]) -> Stream:
-    counters = device.get("counters") or {}
-    lost = sum(int(v) for k, v in counters.items() if "lost" in k or "dropped" in k)
-    return Stream(
-        name=str(device.get("name")),
-        hz=float((device.get("status") or {}).get("rate_hz") or 0.0),
-        lost=lost,
-        age_s=float(device.get("age_s") or 0.0),
-        state=str(device.get("state")),
-        message=str(device.get("message") or ""),
-    )
-
-
-def _sync(state: dict[str, Any]) -> SyncStatus:
-    clocks = state.get("clocks") or {}
-    words = {str(c.get("state")) for c in clocks.values() if isinstance(c, dict) and c.get("state")}
-    skews = {
-        str(name): float(c["skew_ppm"])
-        for name, c in clocks.items()
-        if isinstance(c, dict) and c.get("skew_ppm")
-    }
-    if not clocks:
-        return SyncStatus()
-    return SyncStatus("holdover" if "holdover" in words else "locked", 0.0, skews)
-
-
-def _query(query: Any) -> QueryStatus:
-    if isinstance(query, str):
-        return QueryStatus(query)
-    return QueryStatus(
-        str(query.get("text")), str(query.get("status", "searching")), int(query.get("count") or 0),
-        float(query.get("score") or 0.0), places=[tuple(p) for p in query.get("places") or []],
-    )  # fmt: skip
