@@ -146,10 +146,33 @@ def test_between_has_two_landmarks() -> None:
         ("orange car", ["car"]),
         ("people sitting on benches", ["person"]),
         ("something red", [""]),
+        ("statue of a person", ["statue"]),
+        ("all of the cars", ["car"]),
+        ("person holding umbrella", ["person"]),
+        ("the person holding an umbrella", ["person"]),
+        ("tree taller than the car", ["tree taller than"]),  # not understood, and never the car
+        ("person nearest the bench", ["person"]),
+        ("the nearest bench", ["bench"]),
     ],
 )
 def test_the_noun_of_a_phrase(text: str, nouns: list[str]) -> None:
     assert [phrase.noun for phrase in parse(text).targets] == nouns
+
+
+def test_colours_of_the_thing_itself() -> None:
+    (phrase,) = parse("person in red").targets
+    assert (phrase.noun, phrase.attributes, phrase.relations) == ("person", (Attribute("colour", "red"),), ())
+    (phrase,) = parse("car, red").targets
+    assert (phrase.noun, phrase.attributes) == ("car", (Attribute("colour", "red"),))
+    (phrase,) = parse("person in the red car").targets
+    assert phrase.relations[0].landmarks[0].noun == "car"
+
+
+def test_between_things_of_a_kind() -> None:
+    assert ids("bench between the trees") == []
+    middle = thing(9, "bench", 0, 12, (1.8, 0.6, 0.9))
+    found = select(understand("bench between the trees", Closed()), [*scene(), middle])
+    assert [hit.id for hit in found.hits] == [9]
 
 
 def test_negations() -> None:
@@ -279,6 +302,7 @@ def test_a_full_table_takes_nothing() -> None:
         ("the tallest tree", [6], Status.MATCHED),
         ("shortest tree", [7], Status.MATCHED),
         ("car nearest to the bench", [1], Status.MATCHED),
+        ("car closest the bench", [1], Status.MATCHED),
         ("person farthest from the bench", [5], Status.MATCHED),
         ("person far from the cars", [5], Status.MATCHED),
         ("car between the bench and the tree", [], Status.NOT_FOUND),

@@ -22,6 +22,9 @@ _PUNCTUATION = ",;&"
 _IN_WORDS = "-'"
 _APOSTROPHE = "\u2019"
 _BETWEEN = "between"
+_DOING = ("ing", "ed")
+# "person in red" and "car with red" say a colour of the thing itself
+_OF_ITSELF = ("inside", "next_to")
 _WITHOUT = "without"
 
 
@@ -131,6 +134,10 @@ def tokens(text: str) -> list[str]:
     return [word.removesuffix("'s") for word in words if word]
 
 
+def _only_attributes(phrase: Phrase) -> bool:
+    return bool(phrase.attributes) and not (phrase.noun or phrase.superlative or phrase.relations)
+
+
 def _says_something(phrase: Phrase) -> bool:
     return bool(phrase.attributes or phrase.superlative or phrase.relations)
 
@@ -181,6 +188,9 @@ def _parts(words: list[str]) -> list[list[str]]:
             parts[-1].append(words[k])
             joined = 1
         k += joined
+    if len(parts) > 1 and not _has_noun(parts[-1]):  # "car, red"
+        last = parts.pop()
+        parts[-1] += last
     return [part for part in parts if part]
 
 
@@ -211,13 +221,15 @@ def _phrase(words: Sequence[str]) -> Phrase:
         return replace(target, ignored=(*target.ignored, *words[start:]))
     if kind == _WITHOUT:
         kind, negated = "next_to", not negated
+    if kind in _OF_ITSELF and not negated and _only_attributes(landmarks[0]):
+        return replace(target, attributes=(*target.attributes, *landmarks[0].attributes))
     return replace(target, relations=(Relation(kind, landmarks, negated),))
 
 
 def _sides(words: list[str]) -> list[list[str]]:
-    """Left and right of the first "and"; a landmark in the plural stands for both."""
+    """Left and right of the first "and"; without one ("between the trees") the same stands on both sides."""
     if "and" not in words:
-        return [words]
+        return [words, words]
     k = words.index("and")
     return [words[:k], words[k + 1 :]]
 
@@ -228,7 +240,8 @@ def _first_relation(words: Sequence[str]) -> tuple[int, str, int]:
         if _match(words, k, _grammar().filler)[1] > 1:  # "in the scene" says nothing
             continue
         kind, size = _match(words, k, _grammar().relations)
-        if kind:
+        superlative = " ".join(words[k : k + size]) in _grammar().superlatives
+        if kind and not (superlative and not _has_noun(words[:k])):  # "the nearest car" is none
             return k, kind, size
     return len(words), "", 0
 
@@ -310,16 +323,31 @@ def _colour_or_fruit(pieces: list[_Piece]) -> list[_Piece]:
 def _head(pieces: Sequence[_Piece]) -> tuple[str, tuple[str, ...]]:
     """The noun, and the words around it that were not understood.
 
-    The last word decides: "bus driver" is no bus. What somebody does ("person sitting") is no noun.
+    In a run of words the last decides: "bus driver" is no bus. What follows an article or a doing word is not the
+    noun any more: in "statue of a person" and "person holding an umbrella" it is the first.
     """
-    content = [piece for piece in pieces if piece.role in ("noun", "unknown")]
-    doing: list[_Piece] = []
-    while len(content) > 1 and content[-1].role == "unknown" and content[-1].name.endswith(("ing", "ed")):
-        doing.insert(0, content.pop())
-    if not content:
+    groups = _groups(pieces)
+    named = next((group for group in groups if any(piece.role == "noun" for piece in group)), None)
+    chosen = named or (groups[0] if groups else [])
+    others = [word for group in groups if group is not chosen for piece in group for word in piece.words]
+    if not chosen:
         return "", ()
-    if content[-1].role == "noun":
-        around = [*content[:-1], *doing]
-        return content[-1].name, tuple(word for piece in around for word in piece.words)
-    *first, last = [word for piece in content for word in piece.words]
-    return " ".join([*first, singular(last)]), tuple(piece.name for piece in doing)
+    if chosen[-1].role == "noun":
+        around = [word for piece in chosen[:-1] for word in piece.words]
+        return chosen[-1].name, (*around, *others)
+    *first, last = [word for piece in chosen for word in piece.words]
+    return " ".join([*first, singular(last)]), tuple(others)
+
+
+def _groups(pieces: Sequence[_Piece]) -> list[list[_Piece]]:
+    """Nouns and unknown words in runs, parted by fillers, and by doing words after a noun."""
+    groups: list[list[_Piece]] = [[]]
+    for piece in pieces:
+        doing = piece.role == "unknown" and piece.name.endswith(_DOING)
+        if piece.role == "filler":
+            groups.append([])
+        elif doing and any(before.role == "noun" for before in groups[-1]):
+            groups += [[piece], []]
+        elif piece.role in ("noun", "unknown"):
+            groups[-1].append(piece)
+    return [group for group in groups if group]
