@@ -13,17 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from artemis_edge.config import OdometryConfig
-from artemis_edge.frames import F32, F64, ImuSamples, SyncedFrame, TrackedFrame
+from artemis_edge.frames import F32, F64, CameraImage, ImuSamples, SyncedFrame, TrackedFrame
 from artemis_edge.odometry import imu as inertial
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.deskew import deskew_frame, move_points, window
 from artemis_edge.odometry.image_update import ImageUpdate, SeenScan
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.odometry.local_map import LocalMap
+from artemis_edge.odometry.normals import weakest_direction
 from artemis_edge.odometry.path import Path
 from artemis_edge.odometry.plane_update import Explained, PlaneMeasurement, expected_miss_m
 from artemis_edge.odometry.propagation import ImuNoise, propagate
-from artemis_edge.odometry.registration import DEGENERATE, arm_m
+from artemis_edge.odometry.registration import arm_m
 from artemis_edge.odometry.rest import INSTRUCTION, first_state
 from artemis_edge.odometry.scan_motion import steady
 from artemis_edge.odometry.state import State, iterated_update
@@ -130,7 +131,7 @@ class InertialOdometry:
             self._add(arrived, state, explained is not None)
         self._state, self._turn_rate = state, arrived.path.turn_rate[-1]
         self._imu = inertial.since(self._imu, state.stamp_ns - _KEPT_NS)
-        return self._tracked(frame, arrived.path, state, explained)
+        return self._tracked(frame, arrived.path, state)
 
     def _arrive(self, frame: SyncedFrame, scan: ThinScan) -> _Arrived:
         """Propagate to the end of the frame's window."""
@@ -197,31 +198,24 @@ class InertialOdometry:
                 self._map.begin(points, T)
                 self._lost_in_a_row, self._usual_score = 0, 0.0
 
-    def _tracked(
-        self, frame: SyncedFrame, path: Path, state: State, explained: Explained | None
-    ) -> TrackedFrame:
+    def _tracked(self, frame: SyncedFrame, path: Path, state: State) -> TrackedFrame:
         since_s = (frame.stamp_ns - state.stamp_ns) * 1e-9
         at = path.at(state, since_s)
         first_s, last_s = window(frame)
         motion = path.motion(state, first_s + since_s, last_s + since_s)
-        direction = None
-        if explained is not None:
-            values, vectors = np.linalg.eigh(explained.N)
-            if values[0] < DEGENERATE:
-                direction = path.at(state, 0.0).T_world_lidar[:3, :3] @ vectors[:, 0]
-        poses = tuple(
-            path.at(state, (image.stamp_ns - state.stamp_ns) * 1e-9).T_world_lidar for image in frame.images
-        )
+        scans = deskew_frame(frame, motion.referred_to(since_s))
+        weakest = weakest_direction(scans, self._map.planes, at.T_world_lidar)
+        degenerate = weakest is not None and weakest.degenerate
         return TrackedFrame(
             frame.index,
             frame.stamp_ns,
             at.T_world_lidar,
-            deskew_frame(frame, motion.referred_to(since_s)),
-            direction is not None,
+            scans,
+            degenerate,
             frame.images,
-            poses,
+            tuple(path.at(state, _taken_s(image, state)).T_world_lidar for image in frame.images),
             at.twist,
-            direction,
+            at.T_world_lidar[:3, :3] @ weakest.direction if weakest is not None and degenerate else None,
         )
 
     def _count(self, reason: str, number: int = 1) -> None:
@@ -239,3 +233,11 @@ def _mean_rate(before: State, after: State) -> F64:
     elapsed_s = max((after.stamp_ns - before.stamp_ns) * 1e-9, _SAME_TIME_S)
     rate: F64 = se3.log(T_before_after)[3:] / elapsed_s
     return rate
+
+
+def _taken_s(image: CameraImage, state: State) -> float:
+    """When an image was taken after the state's stamp, its estimated delay taken off, s."""
+    delay_s = (
+        float(state.image_delay_s[state.cameras.index(image.name)]) if image.name in state.cameras else 0.0
+    )
+    return (image.stamp_ns - state.stamp_ns) * 1e-9 - delay_s
