@@ -14,7 +14,7 @@ import pytest
 
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.frames import F64, U8, CameraImage, CameraModel
-from artemis_edge.segmentation.backend import Backend, Prompt, Status
+from artemis_edge.segmentation.backend import Backend, Prompt, Segmentation, Status, Support
 from artemis_edge.segmentation.engine import HereEngine, Job, ProcessEngine, Result, run_job
 from artemis_edge.segmentation.keyframes import Apart, KeyframeStore, is_new, read_keyframes, segment_all
 from artemis_edge.segmentation.knowledge import Knowledge
@@ -137,6 +137,21 @@ def test_bad_photographs_are_counted(backend: Backend) -> None:
         worker.offer(image(0.0, encoded=content), None)
         assert worker.ready() == []
     assert (worker.tally.faulty, worker.tally.first_fault) == (2, "the photograph cannot be decoded")
+
+
+def test_a_photograph_that_the_network_fails_on(backend: Backend) -> None:
+    class Failing:
+        name, classes = "failing", ()
+
+        def support(self, text: str) -> Support:
+            return backend.support(text)
+
+        def segment(self, image: U8, prompts: Sequence[Prompt]) -> Segmentation:
+            raise IndexError("beyond")
+
+    result = run_job(Failing(), Job(png(networks.photograph()), CAR))
+    assert result.segmentation is None
+    assert result.fault == "the network failed on the photograph (IndexError: beyond)"
 
 
 def test_a_broken_engine_does_not_stop_the_map(backend: Backend) -> None:

@@ -16,9 +16,12 @@ from artemis_edge.segmentation.words import canonical
 
 def decode(encoded: bytes) -> U8 | None:
     """Pixels uint8 (h, w, 3) RGB of an encoded photograph; None where it is none."""
-    if not encoded:
+    # as the sensor took it: poses and calibration know nothing of a note that says it is to be turned
+    how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), how) if encoded else None
+    except cv2.error:
         return None
-    pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
     return None if pixels is None else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
 
 
