@@ -136,6 +136,28 @@ def test_what_shows_only_when_it_runs(registry: Registry, tmp_path: Path) -> Non
     assert add(registry, model, classes=tuple("abcd")).outputs == {"logits": (1, 4, 25, 25)}
 
 
+def test_flipped_bytes_are_one_sentence_or_work(
+    registry: Registry, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    whole = networks.semantic(tmp_path / "s.onnx").read_bytes()
+    rng = np.random.default_rng(7)
+    refusals = 0
+    for _ in range(40):
+        content = bytearray(whole)
+        content[rng.integers(len(content))] = rng.integers(256)
+        path = tmp_path / "m.onnx"
+        path.write_bytes(content)
+        try:
+            add(registry, path, classes=tuple("abcd"))
+            registry.remove("m")
+        except InputError as error:
+            refusals += 1
+            assert "\n" not in str(error)
+            assert not registry.store.exists() or list(registry.store.iterdir()) == []
+    assert refusals > 5
+    assert capfd.readouterr() == ("", "")
+
+
 def test_names(registry: Registry, tmp_path: Path) -> None:
     path = networks.semantic(tmp_path / "my model.onnx")
     four = ("a", "b", "c", "d")

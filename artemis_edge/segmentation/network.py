@@ -40,8 +40,8 @@ class Network:
         options.log_severity_level = 4  # what fails is told by us, in one sentence
         try:
             self._session = onnxruntime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"]
-            )
+                str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )  # the fallback would try the same again and print on stdout
         except Exception as error:  # the classes of onnxruntime have no base of their own
             raise InputError(f"{path.name} {_complaint(str(error), onnxruntime.__version__)}") from None
         self.file = path.name
@@ -90,7 +90,7 @@ def _complaint(message: str, version: str) -> str:
     if found := _OPERATOR.search(message):
         operator = found[1] or found[2]
         return f"uses the operator {operator}, which onnxruntime {version} does not have; export it without"
-    if "protobuf" in message.lower():
+    if "protobuf" in message.lower() or "codec can't decode" in message:
         return "is not a complete ONNX file; it may be truncated: download or export it again"
     if "external" in message.lower():
         return "keeps its weights in another file; save the model as one file"
