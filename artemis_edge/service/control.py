@@ -192,12 +192,22 @@ class ControlSocket:
             client.socket.close()
 
 
+def control_path(given: str) -> Path:
+    """The path of the settings, or where it is by default."""
+    return Path(given) if given else default_path()
+
+
 def default_path() -> Path:
     """artemis.sock in the service's runtime directory, else in the user's."""
     for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"):
         if folder := os.environ.get(name, "").split(":")[0]:
             return Path(folder) / "artemis.sock"
     return Path(f"/tmp/artemis-edge-{os.getuid()}") / "artemis.sock"
+
+
+def viewers_path(control: Path) -> Path:
+    """Where the growing mesh is told, beside the control socket."""
+    return control.with_name(control.name + ".map")
 
 
 def _listen(path: Path, mode: int) -> socket.socket:

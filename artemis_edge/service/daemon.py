@@ -27,7 +27,7 @@ from artemis_drivers.udp import Interface, interfaces
 from artemis_edge import health, topics
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.service.capture import Capture
-from artemis_edge.service.control import ControlSocket, default_path
+from artemis_edge.service.control import ControlSocket, control_path
 from artemis_edge.service.live_session import LiveSession, session_folder
 from artemis_edge.service.notify import Notifier
 from artemis_edge.service.outlet import Outlet
@@ -109,8 +109,9 @@ class Daemon:
             raise InputError(str(error)) from None
         self.outlet = Outlet(MessageRing.create(config.service.ring_mb))
         self.capture = Capture(self.rig, self.outlet)
-        path = Path(config.service.socket) if config.service.socket else default_path()
-        self.control = ControlSocket(path, int(config.service.socket_mode, 8), self._answer)
+        self.control = ControlSocket(
+            control_path(config.service.socket), int(config.service.socket_mode, 8), self._answer
+        )
 
     def run(self) -> int:
         """Exit code: 0, or 1 where a recording or a map fell short."""

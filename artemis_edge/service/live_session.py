@@ -14,6 +14,7 @@ from artemis_edge import config as mapping_config
 from artemis_edge.errors import InputError
 from artemis_edge.service import settings
 from artemis_edge.service.children import Child
+from artemis_edge.service.control import control_path, viewers_path
 from artemis_edge.service.mapper import MapperTask
 from artemis_edge.service.outlet import Outlet
 from artemis_edge.service.settings import RunConfig
@@ -135,6 +136,8 @@ class LiveSession:
             self._first,
             mapping_config.to_toml(self.config.mapping),
             self.config.service.checkpoint_s,
+            str(viewers_path(control_path(self.config.service.socket))),
+            int(self.config.service.socket_mode, 8),
         )
         child = Child("artemis_edge.service.mapper", [self.outlet.ring.descriptor], task, _MAPPING_NICE)
         if self.ended_s is not None:

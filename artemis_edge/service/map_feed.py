@@ -102,11 +102,17 @@ class MapFeed:
                 viewer.socket.close()
         return new
 
-    def close(self) -> None:
-        """Let all viewers go and remove the socket."""
+    def forget_viewers(self) -> None:
+        """In a copy of the process that takes over: what was half sent is lost; viewers connect again."""
         for viewer in self._viewers:
+            with contextlib.suppress(OSError):
+                viewer.socket.shutdown(socket.SHUT_RDWR)  # the copies of this process hold it open, too
             viewer.socket.close()
         self._viewers.clear()
+
+    def close(self) -> None:
+        """Let all viewers go and remove the socket."""
+        self.forget_viewers()
         self._listener.close()
         with contextlib.suppress(OSError):
             self.path.unlink()

@@ -26,6 +26,7 @@ from artemis_edge import health
 from artemis_edge.config import Config, from_toml
 from artemis_edge.errors import UserError
 from artemis_edge.service.checkpoint import Checkpoints
+from artemis_edge.service.map_feed import MapFeed
 from artemis_edge.session.feed import LiveFeed
 from artemis_edge.session.line_channel import LineChannel
 from artemis_edge.session.message_ring import MessageRing
@@ -40,13 +41,18 @@ _PR_SET_PDEATHSIG = 1
 
 
 class MapperTask(Struct, frozen=True):
-    """What the service tells the mapping: ``config`` as TOML, the session's folder, where the map goes."""
+    """What the service tells the mapping: ``config`` as TOML, the session's folder, where the map goes.
+
+    ``viewers`` is the path of the socket for viewers of the growing mesh (empty: none), with its file mode.
+    """
 
     folder: str
     out: str
     first: int = 0
     config: str = ""
     checkpoint_s: float = 20.0
+    viewers: str = ""
+    viewers_mode: int = 0o600
 
 
 class LiveMapper:
@@ -60,6 +66,7 @@ class LiveMapper:
         self.checkpoints = Checkpoints(self._reopen)
         self.mapping.before = self.checkpoints.working_on
         self._config, self._pages = config, pages
+        self.viewers = MapFeed(Path(task.viewers), task.viewers_mode) if task.viewers else None
         self._stop_at: int | None = None
         self._checked = time.monotonic()
         self._said = 0.0
@@ -74,6 +81,8 @@ class LiveMapper:
             self.checkpoints.close()
             raise
         self.checkpoints.close()
+        if self.viewers is not None:
+            self.viewers.close()
 
     def _loop(self) -> None:
         while self._stop_at is None or self.feed.next < self._stop_at:
@@ -93,6 +102,8 @@ class LiveMapper:
     def _after_frame(self) -> None:
         if self.mapping.assembler.next_index % _COLLECT_EVERY == 0:
             gc.collect()
+        if self.viewers is not None and self.mapping.delta is not None:
+            self.viewers.add(self.mapping.delta)
         if time.monotonic() - self._checked > self.task.checkpoint_s:
             _call(self.mapping.mapper, "before_copy")
             self._guard(self.checkpoints.take())
@@ -113,11 +124,15 @@ class LiveMapper:
                 self._stop_at = int(line.get("at", 0))
         if self.channel.closed:
             raise ServiceGoneError
+        if self.viewers is not None and self.viewers.turn():
+            _call(self.mapping.mapper, "tell_everything")
         self._say("mapping")
 
     def _reopen(self) -> None:
         _call(self.mapping.mapper, "after_copy")
         self.mapping.keeper.after_copy()
+        if self.viewers is not None:
+            self.viewers.forget_viewers()
 
     def _say(self, state: str, *, force: bool = False, resumed: bool = False) -> None:
         now = time.monotonic()

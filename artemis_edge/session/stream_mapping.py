@@ -15,7 +15,7 @@ import numpy as np
 from artemis_edge import topics
 from artemis_edge.config import Config, to_toml
 from artemis_edge.errors import InputError
-from artemis_edge.frames import SyncedFrame, Trajectory
+from artemis_edge.frames import MeshDelta, SyncedFrame, Trajectory
 from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Mapper
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
@@ -61,6 +61,7 @@ class StreamMapping:
         self.skip: set[int] = set()
         self.latest_ns = 0
         self.fault = ""
+        self.delta: MeshDelta | None = None  # of the latest frame
         self.before: Callable[[int], None] = lambda index: None
 
     def take(self, sent: Sent) -> bool:
@@ -105,7 +106,7 @@ class StreamMapping:
     def _map(self, frame: SyncedFrame) -> None:
         frame = self._prepare(frame)
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
-        self.mapper.process(frame)
+        self.delta = self.mapper.process(frame)
         wall, cpu = time.perf_counter_ns() - wall, time.process_time_ns() - cpu
         self.statistics.add_frame(wall / _NS_PER_MS, cpu / _NS_PER_MS, self.mapper.stage_ms)
         self.statistics.add_lost(frame.lost)

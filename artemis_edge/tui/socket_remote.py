@@ -11,6 +11,8 @@ from typing import Any
 import msgspec
 
 from artemis_edge.frames import MeshDelta
+from artemis_edge.service.control import viewers_path
+from artemis_edge.service.map_feed import MapReader
 from artemis_edge.status import Status
 from artemis_edge.tui.remote import RemoteError
 
@@ -28,6 +30,7 @@ class SocketRemote:
         self._socket: socket.socket | None = None
         self._heard = bytearray()
         self._number = 0
+        self._map = MapReader(viewers_path(path))
 
     def status(self) -> Status:
         """The state as the service tells it."""
@@ -37,8 +40,8 @@ class SocketRemote:
             raise RemoteError("the service is of another version; update the older of the two") from None
 
     def deltas(self) -> list[MeshDelta]:
-        """The control socket carries no mesh."""
-        return []
+        """News of the mesh, from the socket beside the control socket."""
+        return self._map.take()
 
     def ask(self, text: str) -> str:
         """Add a live question."""
@@ -63,6 +66,7 @@ class SocketRemote:
         """Detach."""
         with self._lock:
             self._forget_socket()
+            self._map.close()
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         with self._lock:
