@@ -248,6 +248,18 @@ def test_tokens_of_clip_itself() -> None:
 
 
 @pytest.mark.models
+def test_vectors_of_real_words() -> None:
+    from artemis_edge.segmentation.opening import names_in
+
+    names = names_in(Network(real("yolov8n-seg_rawheads_static-int8_448.onnx")))
+    table = EmbeddingTable(real("coco_clip_text_embeddings.npy"), names)
+    car, truck, banana = table.features(["car", "truck", "banana"])
+    assert float(car @ car) == pytest.approx(1.0, abs=1e-3)
+    assert float(car @ truck) > float(car @ banana) + 0.05
+    assert table.knows("motorcycle") and not table.knows("zorblax")
+
+
+@pytest.mark.models
 @pytest.mark.data
 @pytest.mark.parametrize(
     "name",
