@@ -13,6 +13,7 @@ from artemis_edge.evaluate.trajectory import evaluate_trajectory
 from artemis_edge.frames import CameraImage, CameraModel, ImuSamples, LidarScan, SyncedFrame, Trajectory
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
+from artemis_edge.odometry.search import all_round
 from artemis_edge.trajectory import read_tum
 from tests.box_world import PERIOD_S, corridor, frame, scan, street
 
@@ -249,3 +250,32 @@ def test_hall_at_two_hertz():
     found, odometry = estimate(bag)
     assert evaluate_trajectory(found, read_tum(bag.parent / "poses.tum")).ate_rmse_m < 0.05
     assert odometry.lost == {}
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0, 1])
+def test_hall_at_one_hertz(first):
+    """Every second scan: turns of up to 57 degrees from scan to scan, and nothing else to go by."""
+    bag = data("hilti_os0_handheld", "bag")
+    odometry = LidarOdometry(OdometryConfig())
+    tracked = [odometry.track(f) for k, f in enumerate(open_input(bag).frames()) if k % 2 == first]
+    poses = np.array([t.T_world_lidar for t in tracked])
+    found = Trajectory(np.array([t.stamp_ns for t in tracked]), poses)
+    assert evaluate_trajectory(found, read_tum(bag.parent / "poses.tum")).ate_rmse_m < 0.1
+    assert odometry.lost == {}
+
+
+def test_guesses_all_round_lie_on_the_way_and_about_the_upright_axis():
+    start = se3.exp(np.array([1.0, 2, 3, 0.1, 0.2, 0.3]))
+    goal = start @ se3.exp(np.array([1.0, 0, 0, 0, 0, 0.4]))
+    found = all_round(start, goal, 10.0)
+    assert len(found) == 3 * 37
+    for T in found:
+        turn = se3.log(se3.inverse(start) @ T)[3:]
+        np.testing.assert_allclose(turn[:2], 0.0, atol=1e-9)
+    places = np.unique(np.array([T[:3, 3] for T in found]).round(6), axis=0)
+    assert len(places) == 3
+    few = all_round(start, goal, 0.2)
+    assert len(few) == 3 * 5
+    assert all(abs(se3.log(se3.inverse(start) @ T)[5]) <= 0.35 for T in few)

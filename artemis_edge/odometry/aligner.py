@@ -14,12 +14,15 @@ from artemis_edge.frames import F64
 from artemis_edge.odometry.motion import Prediction
 from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import Registration, arm_m, judge, register
-from artemis_edge.odometry.search import RINGS, guesses
+from artemis_edge.odometry.search import RINGS, all_round, guesses
 from artemis_edge.odometry.thin import TimedPoints
 
 _MIN_MATCHES = 50  # fewer planes do not fix six numbers against outliers
 _GOOD = 0.85  # share of the usual score below which a better guess is sought
 _LOST = 0.4  # share of the usual score below which the pose is not believed
+_DOUBTFUL = (
+    0.6  # share below which it is believed only near the prediction: new places look new, wrong ones too
+)
 _MEMORY = 0.1  # weight of a new frame in the usual score and the usual miss
 _BASIN = 2.0  # displacement that registration mends by itself, in finest voxels
 _JUDGED = 500  # points that judge a guess
@@ -40,9 +43,11 @@ class Aligner:
         if len(scan.points) < _MIN_MATCHES:
             return None
         best = self._best(scan, prediction)
-        if best.matches < _MIN_MATCHES or best.score < _LOST * self._usual_score:
-            return None
         miss = prediction.missed_by_m(best.T_world_lidar, arm_m(scan.points))
+        near = miss < _BASIN * self._config.voxel_m
+        least = _LOST if near else _DOUBTFUL
+        if best.matches < _MIN_MATCHES or best.score < least * self._usual_score:
+            return None
         first = self._usual_score == 0.0
         self._usual_score += (1.0 if first else _MEMORY) * (best.score - self._usual_score)
         self._usual_miss2 += _MEMORY * (miss**2 - self._usual_miss2)
@@ -62,29 +67,28 @@ class Aligner:
             if best.score >= _GOOD * self._usual_score > 0.0:
                 return best
         basin = max(_BASIN * self._config.voxel_m, bound / RINGS)
-        for guess in self._search(scan, prediction, basin):
-            best = max(best, self._register(scan, prediction, guess, basin), key=_score)
-        return best
+        tried = guesses(
+            prediction.T_world_lidar, prediction.sigma_m, prediction.sigma_rad, arm_m(scan.points), basin
+        )
+        best = self._best_of(scan, prediction, [prediction.T_world_start, *tried], basin, best)
+        if best.score >= _GOOD * self._usual_score > 0.0:
+            return best
+        tried = all_round(prediction.T_world_start, prediction.T_world_lidar, prediction.sigma_rad)
+        return self._best_of(scan, prediction, tried, _BASIN * self._config.voxel_m, best)
 
-    def _search(self, scan: TimedPoints, prediction: Prediction, basin_m: float) -> list[F64]:
-        """The few best of the guesses within reach, the last pose among them (a carrier may stop at once)."""
+    def _best_of(
+        self, scan: TimedPoints, prediction: Prediction, tried: list[F64], basin_m: float, best: Registration
+    ) -> Registration:
+        """The best registration from the few best of many guesses, or the one already known."""
         few = TimedPoints(*(a[:: max(len(scan.points) // _JUDGED, 1)] for a in scan))
-        tried = [
-            prediction.T_world_start,
-            *guesses(
-                prediction.T_world_lidar,
-                prediction.sigma_m,
-                prediction.sigma_rad,
-                arm_m(scan.points),
-                basin_m,
-            ),
-        ]
         level, sigma = self._map.level_of(basin_m), 0.5 * basin_m
         scores = []
         for T in tried:
             points = few.at_one_time(prediction.twist(T))
             scores.append(judge(self._map, points, T, sigma, level).score)
-        return [tried[k] for k in np.argsort(scores, kind="stable")[::-1][:_REFINED]]
+        for k in np.argsort(scores, kind="stable")[::-1][:_REFINED]:
+            best = max(best, self._register(scan, prediction, tried[k], basin_m), key=_score)
+        return best
 
     def _register(self, scan: TimedPoints, prediction: Prediction, guess: F64, tau_m: float) -> Registration:
         return register(self._map, scan, prediction, guess, tau_m, self._config.sigma_m)

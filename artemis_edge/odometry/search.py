@@ -13,6 +13,8 @@ from artemis_edge.frames import F64
 from artemis_edge.odometry import se3
 
 RINGS = 5  # guesses at fifths of the reach
+_TURN = np.pi / 18  # spacing of guesses about the upright axis
+_ON_THE_WAY = (0.0, 0.5, 1.0)
 
 
 def ball(radius: float, spacing: float) -> F64:
@@ -24,6 +26,25 @@ def ball(radius: float, spacing: float) -> F64:
     order = np.argsort(length, kind="stable")
     inside: F64 = grid[order][length[order] <= radius * (1 + 1e-9)]
     return inside
+
+
+def all_round(T_world_start: F64, T_world_lidar: F64, reach_rad: float) -> list[F64]:
+    """Poses on the way to a guess, turned about the sensor's upright axis by up to ``reach_rad`` or all round.
+
+    Carriers turn about the vertical more than anything else.
+    """
+    steps = min(int(np.ceil(reach_rad / _TURN)), int(np.pi / _TURN))
+    way = se3.log(se3.inverse(T_world_start) @ T_world_lidar)
+    twists = np.zeros((2 * steps + 1, 6))
+    twists[:, 5] = np.arange(-steps, steps + 1) * _TURN
+    out = []
+    for share in _ON_THE_WAY:
+        place = (T_world_start @ se3.exp(share * way))[:3, 3]
+        for twist in twists:
+            T = T_world_start @ se3.exp(twist)
+            T[:3, 3] = place
+            out.append(T)
+    return out
 
 
 def guesses(T_world_lidar: F64, reach_m: float, reach_rad: float, arm_m: float, basin_m: float) -> list[F64]:
