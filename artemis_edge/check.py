@@ -4,33 +4,55 @@ from __future__ import annotations
 
 import platform
 import sys
+import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from artemis_edge import config, health
+from artemis_edge.check_finding import Finding
 from artemis_edge.errors import UserError
-
-Status = Literal["ok", "warn", "fail"]
 
 _LEAST_PYTHON = (3, 11)
 _LEAST_CORES = 2
 _LEAST_DISK_MB = 2000.0
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """``status`` ok, warn (works, but not well) or fail (does not work), and a sentence."""
-
-    name: str
-    status: Status
-    detail: str
-
-
 def check(config_file: Path | None = None) -> list[Finding]:
-    """Look at everything that can be looked at without a recording."""
+    """Look at everything that can be looked at without a recording.
+
+    ``config_file`` is a rig's (as of ``run --config``), whose devices are then looked at, too, or a mapping's.
+    """
+    if config_file is not None and _is_rig(config_file):
+        return _with_rig(config_file)
     settings, about_settings = _configuration(config_file)
+    return _machine(settings, about_settings)
+
+
+def _with_rig(file: Path) -> list[Finding]:
+    from artemis_edge.check_rig import check_rig
+    from artemis_edge.service import settings
+
+    try:
+        rig = settings.load(file)
+    except UserError as error:
+        return _machine(config.Config(), Finding("configuration", "fail", str(error)))
+    return [*_machine(rig.mapping, Finding("configuration", "ok", f"{file} is valid")), *check_rig(rig)]
+
+
+def _is_rig(file: Path) -> bool:
+    """A profile that ships, or a file that names devices; what cannot be read is left to the mapping's reader."""
+    if not file.is_file():
+        return not file.suffix and not file.parent.name
+    try:
+        tree = tomllib.loads(file.read_text())
+    except (OSError, ValueError):
+        return False
+    return bool(tree.keys() & {"lidar", "imu", "camera", "trigger", "service", "calibration"})
+
+
+def _machine(settings: config.Config, about_settings: Finding) -> list[Finding]:
     return [
         _python(),
         _cores(),

@@ -13,6 +13,7 @@ from textual.pilot import Pilot
 from textual.widgets import DataTable, Input, Static
 
 from artemis_edge import check
+from artemis_edge.check_finding import Finding
 from artemis_edge.commands.tui import read_keys
 from artemis_edge.errors import InputError
 from artemis_edge.frames import MeshDelta
@@ -193,7 +194,7 @@ def test_start_stop_mark_view_and_zoom(tmp_path: Path) -> None:
 
 
 def test_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = [check.Finding("disk", "warn", "1 GB free"), check.Finding("clock", "fail", "no pulse")]
+    found = [Finding("disk", "warn", "1 GB free"), Finding("clock", "fail", "no pulse")]
     monkeypatch.setattr(check, "check", lambda: found)
     (tmp_path / "walk").mkdir()
     (tmp_path / "walk" / "session.mcap").write_bytes(b"no recording")

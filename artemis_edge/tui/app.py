@@ -262,6 +262,8 @@ class ArtemisTui(App[None]):
             self.call_from_thread(what, *arguments, **words)
 
     def _take(self, status: Status) -> None:
+        if not self.is_screen_installed("live"):
+            return  # the application is ending
         self._lost = ""
         if status.report and not self.status.report:
             self.notify("the map is saved; press o for the report")

@@ -13,7 +13,7 @@ from textual.containers import VerticalScroll
 from textual.screen import Screen
 from textual.widgets import DataTable, Footer, Markdown, Static
 
-from artemis_edge.check import Finding
+from artemis_edge.check_finding import Finding
 
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
