@@ -16,7 +16,7 @@ help:
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   what a frame costs on this machine"
 	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
-	@echo "make viewer-test  exported GLB in three.js (fetches it with npm) in headless Chromium"
+	@echo "make viewer-test  GLB and browser view in headless Chromium (fetches three.js with npm)"
 	@echo "make train   render views of the virtual worlds, train and export the shipped network (an hour or two, torch)"
 	@echo "make setup   only create $(VENV); every target does it when needed"
 	@echo "make clean   remove $(VENV) and everything that was generated"
@@ -52,7 +52,7 @@ soak: $(READY)
 viewer-test: $(READY)
 	@command -v npm >/dev/null || { echo "npm is needed: on Debian and Ubuntu: apt install npm chromium"; exit 2; }
 	@cd tests/viewer && npm install --no-audit --no-fund --no-package-lock --silent
-	@$(BIN)/python -m pytest tests/viewer
+	@ARTEMIS_VIEWER=1 $(BIN)/python -m pytest tests/viewer
 
 # Seeds: learnt from, calibrated with, judged by. Worlds that are used otherwise have seeds far below these.
 train: $(READY)

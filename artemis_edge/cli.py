@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from artemis_edge.commands import models, output, replay, rig, run, session, texture, tui
+from artemis_edge.commands import models, output, replay, rig, run, session, texture, tui, view
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -98,6 +98,7 @@ def _parser() -> argparse.ArgumentParser:
         _bench,
         output.add_render,
         output.add_export,
+        view.add,
         _check,
         session.add,
         replay.add,

@@ -337,6 +337,13 @@ class SegmentationConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 200
 
 
+class ViewConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """The map as it grows, for `artemis-edge view` in another process (view/feed.py)."""
+
+    socket: Annotated[str, Meta(description="Unix socket to tell changes on; empty: nobody is told.")] = ""
+    most_hz: Annotated[float, _float("Messages a second at most; newest state wins.", ge=0.1, le=100.0)] = 5.0
+
+
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole configuration: one section a stage."""
 
@@ -346,6 +353,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     mesher: MesherConfig = MesherConfig()
     refinement: RefinementConfig = RefinementConfig()
     keep: KeepConfig = KeepConfig()
+    view: ViewConfig = ViewConfig()
     segmentation: SegmentationConfig = SegmentationConfig()
 
 

@@ -22,6 +22,8 @@ from artemis_edge.progress import Report, say
 from artemis_edge.session.results import disk_sentence
 from artemis_edge.session.statistics import RunStatistics
 
+Publish = Callable[[MeshDelta], None]
+
 _NS_PER_MS = 1e6
 # Cycles are collected between frames, not inside one; what the warm-up left is frozen and costs nothing.
 _COLLECT_EVERY = 100
@@ -43,8 +45,12 @@ class Mapper(Protocol):
         """All stages for one frame."""
         ...
 
-    def finish(self) -> object:
+    def finish(self) -> MeshDelta | None:
         """Work that was postponed."""
+        ...
+
+    def tell_again(self) -> None:
+        """The deltas to come hold the whole map once more."""
         ...
 
     def write_mesh(self, path: Path) -> Mesh:
@@ -84,13 +90,21 @@ class MappingRun:
     """Feeds the frames ``span`` of a source to a mapper and keeps the account in ``statistics``.
 
     ``stopped`` says why the run ended early (None: it did not), ``fault`` is the first sentence about a frame
-    that was skipped.
+    that was skipped. ``publish`` is offered every delta, outside the time of the frame.
     """
 
-    def __init__(self, mapper: Mapper, source: FrameSource, span: range, statistics: RunStatistics) -> None:
+    def __init__(
+        self,
+        mapper: Mapper,
+        source: FrameSource,
+        span: range,
+        statistics: RunStatistics,
+        publish: Publish = lambda delta: None,
+    ) -> None:
         self.stopped: str | None = None
         self.fault: InputError | None = None
         self._mapper, self._source, self._span, self._statistics = mapper, source, span, statistics
+        self._publish = publish
 
     def frames(
         self, report: Report, interrupt: Interrupt, prepare: Callable[[SyncedFrame], SyncedFrame]
@@ -115,12 +129,15 @@ class MappingRun:
     def flush(self) -> None:
         """The work that was postponed, counted apart."""
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
+        delta = None
         try:
-            self._mapper.finish()
+            delta = self._mapper.finish()
         except (RunError, OSError) as error:
             self._stop(_sentence(error))
         self._statistics.flush_ms = (time.perf_counter_ns() - wall) / _NS_PER_MS
         self._statistics.flush_cpu_ms = (time.process_time_ns() - cpu) / _NS_PER_MS
+        if delta is not None:
+            self._publish(delta)
 
     def trajectory(self) -> Trajectory:
         """The pose of every frame that was mapped."""
@@ -132,7 +149,7 @@ class MappingRun:
         try:
             frame = prepare(frame)
             wall, cpu = time.perf_counter_ns(), time.process_time_ns()
-            self._mapper.process(frame)
+            delta = self._mapper.process(frame)
             wall, cpu = time.perf_counter_ns() - wall, time.process_time_ns() - cpu
         except InputError as error:
             return error
@@ -141,6 +158,7 @@ class MappingRun:
             return None
         self._statistics.add_frame(wall / _NS_PER_MS, cpu / _NS_PER_MS, self._mapper.stage_ms)
         self._statistics.add_lost(frame.lost)
+        self._publish(delta)
         return None
 
     def _skip(self, fault: InputError) -> None:

@@ -28,6 +28,7 @@ from artemis_edge.progress import Report, silent
 from artemis_edge.session.photos import INDEX, HeldOut
 from artemis_edge.session.report import Evaluation, RunStatistics, write_report
 from artemis_edge.session.results import Results, prepare, scratch
+from artemis_edge.telling import telling
 from artemis_edge.trajectory import hole_sentence, pose_per_frame, read_tum, write_tum
 
 _WARM_UP_FRAMES = 3
@@ -92,11 +93,11 @@ def reprocess(
     prepare(request.out)
     statistics = RunStatistics(source.name, source.input_hz, config_toml=to_toml(request.config))
     with scratch(request.out) as pages:
-        with Interrupt() as interrupt:
+        with Interrupt() as interrupt, telling(request.config.view) as live:
             warm_up_run(request, odometry, pages, source, span, statistics, make)
             tracker = odometry()
             mapper = make(request.config, tracker, pages)
-            run = MappingRun(mapper, source, span, statistics)
+            run = MappingRun(mapper, source, span, statistics, live.watching(mapper))
             photos = HeldOut(request.out, request.holdout)
             keeper = Keeper(pages, request.config.keep, request.config.segmentation)
             run.frames(report, interrupt, keeper.between(photos.take, mapper))

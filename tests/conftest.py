@@ -48,6 +48,9 @@ class FakeMapper:
     def finish(self) -> None:
         self.finished = True
 
+    def tell_again(self) -> None:
+        pass
+
     def write_mesh(self, path: Path) -> Mesh:
         corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
         vertices = np.concatenate([corner + T[:3, 3].astype(np.float32) for _, T in self.trajectory])

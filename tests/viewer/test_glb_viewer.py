@@ -15,12 +15,13 @@ from artemis_edge.frames import CameraModel
 from artemis_edge.render import render_coloured
 from artemis_edge.trajectory import matrix_from_quaternion
 from tests.textured import square_room
-from tests.viewer.browser import CHROMIUM, screenshot, serving
+from tests.viewer.browser import CHROMIUM, page, serving
 
 HERE = Path(__file__).parent
 THREE = HERE / "node_modules" / "three"
 WIDTH, HEIGHT, FOCAL = 320, 240, 200.0
 
+pytest.importorskip("websockets")
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
     pytest.mark.skipif(not THREE.is_dir(), reason="three.js is not there; run `make viewer-test`"),
@@ -37,7 +38,13 @@ def test_three_js_shows_the_texture_where_we_do(tmp_path: Path) -> None:
         "fov": np.degrees(2 * np.arctan(0.5 * HEIGHT / FOCAL)), "eye": "-1,0.2,0", "target": "2,-0.3,-0.4",
     }  # fmt: skip
     with serving(tmp_path) as address:
-        seen = screenshot(f"{address}/page.html?{urlencode(options)}", tmp_path / "seen.png", WIDTH, HEIGHT)
+        url = f"{address}/page.html?{urlencode(options)}"
+        with page(url, tmp_path, WIDTH, HEIGHT) as shown:
+            title = shown.until(
+                lambda: (t := shown.evaluate("document.title")) != "loading" and t, "the model"
+            )
+            assert title == "drawn"
+            seen = shown.picture(tmp_path / "seen.png")
     ours = render_coloured(mesh, atlas, camera(), looking([-1, 0, 0.2], [2, 0.4, -0.3]))
     blank = (seen == 255).all(axis=2)
     assert 0.4 < ours.covered.mean() < 0.95
