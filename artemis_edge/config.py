@@ -259,8 +259,8 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
         float, _float("Surfaces farther than this are not coloured [m].", ge=1.0, le=1000.0)
     ] = 80.0
     texel_px: Annotated[
-        float, _float("Edge of a texel in pixels of the closest image.", ge=0.25, le=64.0)
-    ] = 1.0
+        float, _float("Edge of a texel at most, in pixels of the closest image.", ge=0.25, le=64.0)
+    ] = 1.4
     finest_texel_m: Annotated[float, _float("Texels are never smaller than this [m].", ge=0.001, le=1.0)] = (
         0.00625
     )
@@ -273,9 +273,14 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
     vignetting: Annotated[
         bool, Meta(description="Whether the fall-off of lenses towards their corners is undone.")
     ] = True
-    share: Annotated[
-        float, _float("Share of the surface in view that one image colours.", ge=0.01, le=1.0)
-    ] = 1.0
+    most_texels: Annotated[
+        int,
+        Meta(
+            description="Texels that one image colours while the map grows; each takes about 60 ns.",
+            ge=1000,
+            le=100_000_000,
+        ),
+    ] = 100_000
     wait_frames: Annotated[
         int, Meta(description="Frames after which an image is used, if its surface is meshed.", ge=0, le=1000)
     ] = 6

@@ -96,9 +96,9 @@ def reprocess(
         with Interrupt() as interrupt, telling(request.config.view) as live:
             warm_up_run(request, odometry, pages, source, span, statistics, make)
             tracker = odometry()
-            mapper = make(request.config, tracker, pages)
-            run = MappingRun(mapper, source, span, statistics, live.watching(mapper))
             photos = HeldOut(request.out, request.holdout)
+            mapper = make(request.config, photos.watching(tracker), pages)
+            run = MappingRun(mapper, source, span, statistics, live.watching(mapper))
             keeper = Keeper(pages, request.config.keep, request.config.segmentation)
             run.frames(report, interrupt, keeper.between(photos.take, mapper))
             if not statistics.frame_ms:

@@ -25,8 +25,9 @@ def estimate_gain(store: Store, seen: Observations, photo: Photo, trust: Trust) 
     The median over the vertices both know: people who walk through and highlights do not move it. Ones where image
     and map have too little in common.
     """
-    known = store.attribute[seen.slot, INFORMATION] * trust.noise2 >= 0.5
-    rows = np.flatnonzero(known & (seen.geometric > 0.5))
+    rows = np.arange(0, len(seen.slot), max(len(seen.slot) // _MOST_COMMON, 1))
+    known = store.attribute[seen.slot[rows], INFORMATION] * trust.noise2 >= 0.5
+    rows = rows[known & (seen.geometric[rows] > 0.5)]
     mean = store.attribute[seen.slot[rows], COLOUR : COLOUR + 3]
     colour = seen.colour[rows]
     shade = shades(photo, seen.pixel[rows])
@@ -34,8 +35,7 @@ def estimate_gain(store: Store, seen: Observations, photo: Photo, trust: Trust) 
     if np.count_nonzero(usable) < _LEAST_COMMON:
         return np.ones(3, np.float32)
     mean, colour = mean[usable], (colour * shade[:, None])[usable]
-    every = -(-len(mean) // _MOST_COMMON)
-    gain: F64 = np.median(mean[::every] / colour[::every], axis=0)
+    gain: F64 = np.median(mean / colour, axis=0)
     within: F32 = gain.clip(1.0 / _LARGEST_GAIN, _LARGEST_GAIN).astype(np.float32)
     return within
 

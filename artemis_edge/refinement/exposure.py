@@ -14,10 +14,11 @@ import numpy as np
 from artemis_edge.frames import F32, F64, I64, CameraModel
 from artemis_edge.refinement.reliability import Observations
 
-# Of the vertices every so-manieth by its slot, the same ones in each image; about 3000 of a view
-_MOST_OF_ONE_VIEW = 3000
+# Of the vertices every so-manieth by its slot, the same ones in each image; about 1500 of a view
+_MOST_OF_ONE_VIEW = 1500
 _DARK, _BRIGHT = 12.0, 245.0
 _ROUNDS = 40  # of alternating least squares with weights 1 / (1 + (e / _SCATTER)^2)
+_TURNS, _INNER_ROUNDS = 6, 8  # of fall-off and gains in turn
 _SCATTER = 0.15
 _POWERS = 3  # of r^2 in the logarithm of the fall-off
 SHADES = 65  # of the table of a fall-off, over r^2 from the principal point to the corner
@@ -106,11 +107,11 @@ def _mean_by(key: I64, weight: F64, value: F64, n: int) -> F64:
     return mean
 
 
-def _gains(place: I64, image: I64, colour: F64, n: int) -> F64:
+def _gains(place: I64, image: I64, colour: F64, n: int, rounds: int = _ROUNDS) -> F64:
     """Logarithms of the gains, float64 (n,), of mean zero."""
     gain, weight = np.zeros(n), np.ones(len(colour))
     places = int(place.max()) + 1 if len(place) else 0
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         bright = _mean_by(place, weight, colour + gain[image], places)
         gain = _mean_by(image, weight, bright[place] - colour, n)
         gain -= gain.mean()
@@ -125,8 +126,8 @@ def _falloff(place: I64, image: I64, colour: F64, r2: F64, camera: I64, cameras:
     F = np.stack(columns, axis=1)
     places = int(place.max()) + 1 if len(place) else 0
     weight, out = np.ones(len(colour)), np.zeros(len(columns))
-    for _ in range(_ROUNDS // 4):
-        gain = _gains(place, image, colour - F @ out, n)
+    for _ in range(_TURNS):
+        gain = _gains(place, image, colour - F @ out, n, _INNER_ROUNDS)
         rest = colour + gain[image]
         # what places cannot explain: columns and values less their means over each place
         bare = F - np.stack([_mean_by(place, weight, f, places)[place] for f in F.T], axis=1)

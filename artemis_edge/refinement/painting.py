@@ -40,8 +40,8 @@ from artemis_edge.refinement.texels import (
 )
 from artemis_edge.refinement.visible import NEAR_M, Visible
 
-# Triangles are widened by so many texels: of a texel half covered one colour is known, and interpolation needs it
-WIDEN = 0.75
+# Triangles are widened by so many texels: none falls between two of them, and hardly any is painted twice
+WIDEN = 0.02
 # A chart serves triangles up to 60 degrees off its direction: their texels are stretched by two at most
 FACES = 0.5
 _CLEARLY = 0.8  # cosine from which a direction is preferred to one that has a chart but serves only just
@@ -97,7 +97,7 @@ def wanted_level(footprint_m: float, brush: Brush) -> int:
     """Coarsest level whose texels are at most ``texel_px`` pixels of a view with this footprint."""
     edge_m = brush.voxel_m / COARSEST
     level = 0
-    while level < brush.finest and edge_m > brush.texel_px * footprint_m * 1.2:
+    while level < brush.finest and edge_m > brush.texel_px * footprint_m:
         edge_m *= 0.5
         level += 1
     return level

@@ -82,6 +82,8 @@ def geometric(front: float, near: float, slope: float, sigma: float) -> float:
     nearness of the surface itself changes within the depth map's resolution.
     """
     r = max(front - near - min(slope, _STEEPEST * near), 0.0) / near
+    if r == 0.0:  # nearly always
+        return 1.0
     return math.exp(-0.5 * (r / sigma) * (r / sigma))
 
 

@@ -20,12 +20,13 @@ from artemis_edge.refinement.painting import new_brush, paint
 from artemis_edge.refinement.photographs import Keyframes, Refused, Waiting, arrivals, decode
 from artemis_edge.refinement.reliability import Trust, new_observations
 from artemis_edge.refinement.texel_pages import TexelPages
-from artemis_edge.refinement.view import Viewer
+from artemis_edge.refinement.view import View, Viewer
 from artemis_edge.voxel_map import VoxelMap
 
 # Of the voxels in view, that may still wait for their first patch when an image is used
 _UNMESHED = 0.1
 _EVERYTHING = 1 << 16  # more than any texel's information as stored
+_LEARNT = (4, 8, 16, 32)  # keyframes after which the lenses' fall-off is found
 _LITTLE = 0.25  # good observations, below which keyframes are asked again
 _PARTS = 64  # of the surface, by which ``share`` is told
 
@@ -46,13 +47,14 @@ def trust_of(config: RefinementConfig) -> Trust:
 class Refinement:
     """Colours vertices and texels with the images of the frames.
 
-    ``share`` (0..1] of the surface in view is coloured by each image; the overload control lowers it.
+    While the map grows an image colours ``share`` x ``most_texels`` texels, of other voxels than the one before; the
+    overload control lowers ``share`` (0..1].
     """
 
     def __init__(
         self, config: RefinementConfig, voxel_map: VoxelMap, budget_bytes: float, folder: Path
     ) -> None:
-        self.share = config.share
+        self.share = 1.0
         self.refused = Refused()
         self.keyframes = Keyframes(folder, config.keyframes)
         self.texels = tx.allocate(config.texel_share * budget_bytes)
@@ -63,6 +65,8 @@ class Refinement:
         self._brush = new_brush(voxel_map.config.voxel_m, config.texel_px, config.finest_texel_m)
         self._waiting: deque[Waiting] = deque()
         self._looks = 0
+        self._in_view = 0.0
+        self._exposures = Exposures(config.vignetting)
         self._shades: dict[str, F32] = {}
 
     def update(self, frame: TrackedFrame, stamp: int) -> None:
@@ -71,17 +75,19 @@ class Refinement:
         most = 2 * max(len(frame.images), 1)  # of those that waited, so that one frame never pays for many
         while self._waiting and most > 0 and self._is_due(self._waiting[0], stamp):
             waiting = self._waiting.popleft()
-            self.keyframes.offer(waiting)
-            self._fuse(waiting, _EVERYTHING)
+            self._fuse(waiting, _EVERYTHING, learn=self.keyframes.offer(waiting))
             most -= 1
 
     def finish(self) -> None:
         """Use all images that wait; then give what was meshed late its colour from the keyframes."""
         unseen = int(_LITTLE * tx.INFORMATION_SCALE)
         before = len(self.keyframes)
-        gains = self._settle_exposures()
-        for waiting, gain in zip(self._waiting, gains, strict=True):
-            self._fuse(waiting, _EVERYTHING, gain)
+        if self._looks == 0:  # a map without colours: all images decide together what its exposure is
+            for waiting, gain in zip(self._waiting, self._settle_exposures(), strict=True):
+                self._fuse(waiting, _EVERYTHING, gain)
+        else:
+            for waiting in self._waiting:
+                self._fuse(waiting, _EVERYTHING)
         self._waiting.clear()
         for k in range(before):
             self._fuse(self.keyframes.get(k), unseen)
@@ -126,19 +132,29 @@ class Refinement:
         gains, self._shades = exposures.solve()
         return gains
 
-    def _fuse(self, waiting: Waiting, enough: int, gain: F32 | None = None) -> None:
+    def _learn(self, waiting: Waiting, view: View) -> None:
+        """Keep what a keyframe says of exposures; from time to time find the lenses' fall-off anew."""
+        if self._config.vignetting and len(self._exposures) < _LEARNT[-1]:
+            self._exposures.add(waiting.image.name, waiting.image.model, view.seen)
+            if len(self._exposures) in _LEARNT:
+                self._shades = self._exposures.solve()[1]
+
+    def _fuse(self, waiting: Waiting, enough: int, gain: F32 | None = None, learn: bool = False) -> None:
         pixels = decode(waiting.image, self.refused)
         if pixels is None:
             return
         self._looks += 1
         model = waiting.image.model
         view = self.viewer.look(pixels, model, waiting.T_world_cam, sharpness(waiting.image, waiting.twist))
+        if learn:
+            self._learn(waiting, view)
         view = self.viewer.weigh(view, gain, self._shades.get(waiting.image.name))
         store, voxel_m = self._map.store, self._map.config.voxel_m
         if enough == _EVERYTHING:
             spacing = model.fx * voxel_m / 4
             update_vertices(store, view.seen, spacing, view.photo.sharpness, self.trust)
-        paint(
+        part = _PARTS if gain is not None or enough != _EVERYTHING else self._part()
+        painted = paint(
             self.texels,
             view.visible,
             store.vertex,
@@ -146,9 +162,15 @@ class Refinement:
             self.trust,
             self._brush,
             self._looks,
-            max(round(self.share * _PARTS), 1),
+            part,
             enough,
         )
+        self._in_view = painted * _PARTS / part
+
+    def _part(self) -> int:
+        """How many of ``_PARTS`` of the surface the next image colours, by how much the last one had in view."""
+        wanted = self.share * self._config.most_texels / max(self._in_view, 1.0)
+        return int(min(max(round(wanted * _PARTS), 1), _PARTS))
 
 
 def sharpness(image: CameraImage, twist: F64) -> float:

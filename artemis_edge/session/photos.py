@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from artemis_edge.export.atomic import write_bytes
-from artemis_edge.frames import F64, CameraImage, SyncedFrame, Trajectory
+from artemis_edge.frames import F64, CameraImage, Odometry, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.trajectory import covered, interpolate, inverse
 
 INDEX = "PHOTOS.json"
@@ -28,6 +28,15 @@ class _Photo:
     image: CameraImage
 
 
+@dataclass(frozen=True, slots=True)
+class _Watching:
+    odometry: Odometry
+    held: HeldOut
+
+    def track(self, frame: SyncedFrame) -> TrackedFrame:
+        return self.held.track(self.odometry, frame)
+
+
 @dataclass(slots=True)
 class HeldOut:
     """Takes every ``every``-th image of each camera, in order of time, out of the frames (0: none).
@@ -40,13 +49,32 @@ class HeldOut:
     every: int
     _seen: dict[str, int] = field(default_factory=dict)
     _photos: list[_Photo] = field(default_factory=list)
+    _of_frame: tuple[CameraImage, ...] = ()
+    _poses: dict[tuple[str, int], F64] = field(default_factory=dict)
 
     def take(self, frame: SyncedFrame) -> SyncedFrame:
         """The frame without what is held out."""
+        self._of_frame = ()
         if self.every == 0 or not frame.images:
             return frame
         kept = tuple(image for image in frame.images if not self._takes(image))
         return replace(frame, images=kept)
+
+    def watching(self, odometry: Odometry) -> Odometry:
+        """The odometry, asked besides where the photographs held out were taken."""
+        return odometry if self.every == 0 else _Watching(odometry, self)
+
+    def track(self, odometry: Odometry, frame: SyncedFrame) -> TrackedFrame:
+        """The tracked frame; the photographs held out of it get the pose at their time, but go no further."""
+        held = self._of_frame
+        if not held:
+            return odometry.track(frame)
+        self._of_frame = ()
+        tracked = odometry.track(replace(frame, images=(*frame.images, *held)))
+        n = len(frame.images)
+        for image, T in zip(held, tracked.image_poses[n:], strict=False):
+            self._poses[image.name, image.stamp_ns] = T
+        return replace(tracked, images=tracked.images[:n], image_poses=tracked.image_poses[:n])
 
     def _takes(self, image: CameraImage) -> bool:
         number = self._seen.get(image.name, 0) + 1
@@ -56,7 +84,9 @@ class HeldOut:
         file = f"{FOLDER}/{image.name}_{number:06d}.{suffix_of(image.encoded)}"
         (self.out / FOLDER).mkdir(exist_ok=True)
         write_bytes(self.out / file, image.encoded)
-        self._photos.append(_Photo(file, replace(image, encoded=b"")))
+        bare = replace(image, encoded=b"")
+        self._photos.append(_Photo(file, bare))
+        self._of_frame = (*self._of_frame, bare)
         return True
 
     def remove_earlier(self) -> None:
@@ -78,14 +108,17 @@ class HeldOut:
     def write_index(self, path: Path, trajectory: Trajectory) -> int:
         """Write PHOTOS.json; returns how many photographs have no pose and are not in it.
 
-        The pose of a photograph is interpolated at the middle of its exposure.
+        The pose of a photograph is the odometry's at the middle of its exposure, else interpolated there.
         """
         stamps = np.array([photo.image.stamp_ns for photo in self._photos], np.int64)
         known = covered(trajectory, stamps)
         poses = interpolate(trajectory, stamps) if known.any() else np.empty((0, 4, 4))
-        content = [
-            photo_entry(self._photos[k].file, self._photos[k].image, poses[k]) for k in np.flatnonzero(known)
-        ]
+        content = []
+        for k, photo in enumerate(self._photos):
+            T = self._poses.get((photo.image.name, photo.image.stamp_ns), poses[k] if known[k] else None)
+            known[k] = T is not None
+            if T is not None:
+                content.append(photo_entry(photo.file, photo.image, T))
         write_bytes(path, (json.dumps({"photos": content}, indent=1) + "\n").encode())
         return int(np.count_nonzero(~known))
 
