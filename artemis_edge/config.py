@@ -343,10 +343,9 @@ class SegmentationConfig(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ViewConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """The map as it grows, for `artemis-edge view` in another process (view/feed.py)."""
+    """The map of a `reprocess` as it grows, for `artemis-edge view --live` in another process (telling.py)."""
 
     socket: Annotated[str, Meta(description="Unix socket to tell changes on; empty: nobody is told.")] = ""
-    most_hz: Annotated[float, _float("Messages a second at most; newest state wins.", ge=0.1, le=100.0)] = 5.0
 
 
 class Config(Struct, frozen=True, forbid_unknown_fields=True):

@@ -192,10 +192,6 @@ class Outbox:
         """Delta of all blocks not told yet."""
         return self._tell(index, self._changed())
 
-    def tell_again(self) -> None:
-        """All resident blocks are to be told once more, for a viewer that knows nothing yet."""
-        self._store.block[: self._store.counter[N_BLOCKS], CHANGED] = 1
-
     def _changed(self) -> I32:
         # only resident blocks have CHANGED set: what goes to disk has been told
         used = self._store.counter[N_BLOCKS]

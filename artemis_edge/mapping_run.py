@@ -49,7 +49,7 @@ class Mapper(Protocol):
         """Work that was postponed."""
         ...
 
-    def tell_again(self) -> None:
+    def tell_everything(self) -> None:
         """The deltas to come hold the whole map once more."""
         ...
 

@@ -84,10 +84,6 @@ class Pipeline:
         with self._stage("delta"):
             return self.outbox.everything(self._stamp)
 
-    def tell_again(self) -> None:
-        """The deltas to come hold the whole resident map once more."""
-        self.outbox.tell_again()
-
     @property
     def lost(self) -> dict[str, int]:
         """What the stages could not take, by reason; empty when nothing was lost."""

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from artemis_edge.config import ViewConfig
+from artemis_edge.errors import InputError
 from artemis_edge.frames import MeshDelta
 from artemis_edge.mapping_run import Mapper
-from artemis_edge.view.feed import LiveFeed
+from artemis_edge.service.map_feed import MapFeed
 
-# What a viewer may take to fetch the end of the map, once, after the last frame.
-_FAREWELL_S = 5.0
+_ONLY_THIS_USER = 0o600
+# What viewers may take to fetch the end of the map, once, after the last frame.
+_FAREWELL_S, _FAREWELL_EVERY_S = 5.0, 0.01
 
 
 class Telling:
-    """Hands deltas to the feed; without one to nobody."""
+    """Hands deltas to the feed, which never waits; without one to nobody."""
 
-    def __init__(self, feed: LiveFeed | None) -> None:
+    def __init__(self, feed: MapFeed | None) -> None:
         self._feed = feed
 
     def watching(self, mapper: Mapper) -> Callable[[MeshDelta], None]:
@@ -28,23 +31,37 @@ class Telling:
             feed = self._feed
             if feed is None:
                 return
-            feed.publish(delta, mapper.trajectory[-1][1] if mapper.trajectory else None)
-            if feed.attached:
-                feed.attached = False
-                mapper.tell_again()
+            feed.add(delta)
+            if feed.turn():
+                mapper.tell_everything()
 
         return publish
 
 
 @contextmanager
 def telling(rules: ViewConfig) -> Iterator[Telling]:
-    """The feed of ``view.socket`` while the block runs, emptied at its end."""
+    """The feed of ``view.socket`` while the block runs; InputError if it cannot be there."""
     if not rules.socket:
         yield Telling(None)
         return
-    feed = LiveFeed(Path(rules.socket), rules.most_hz)
+    feed = _feed(Path(rules.socket))
     try:
         yield Telling(feed)
-        feed.drain(_FAREWELL_S)
+        end = time.monotonic() + _FAREWELL_S
+        while feed.waiting and time.monotonic() < end:
+            feed.turn()
+            time.sleep(_FAREWELL_EVERY_S)
     finally:
         feed.close()
+
+
+def _feed(path: Path) -> MapFeed:
+    if path.exists() and not path.is_socket():
+        raise InputError(f"{path} is there and no socket; give another view.socket")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return MapFeed(path, _ONLY_THIS_USER)
+    except OSError as error:
+        raise InputError(
+            f"cannot make the socket {path}: {error.strerror or error}; give another view.socket"
+        ) from None

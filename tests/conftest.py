@@ -48,7 +48,7 @@ class FakeMapper:
     def finish(self) -> None:
         self.finished = True
 
-    def tell_again(self) -> None:
+    def tell_everything(self) -> None:
         pass
 
     def write_mesh(self, path: Path) -> Mesh:

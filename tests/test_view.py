@@ -1,7 +1,6 @@
 """The feed to a viewer, the growing mesh it makes, the gate and the colours; the browser itself: tests/viewer."""
 
 import socket
-import threading
 import time
 import urllib.error
 import urllib.request
@@ -10,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from artemis_edge.config import ViewConfig
 from artemis_edge.errors import InputError
 from artemis_edge.export.mesh import bare_mesh
 from artemis_edge.frames import MeshDelta
-from artemis_edge.view import feed as feeds
-from artemis_edge.view.feed import LiveFeed, Patch, Update, decode, encode, patches, receive
+from artemis_edge.service.map_feed import MapReader
+from artemis_edge.telling import telling
 from artemis_edge.view.gate import Gate, answer
 from artemis_edge.view.kinds import KINDS, coloured
-from artemis_edge.view.live_mesh import LiveMesh, region_of
+from artemis_edge.view.live import map_socket
+from artemis_edge.view.live_mesh import LiveMesh, Patch, patches, region_of
 from tests.textured import square_room
 
 
@@ -64,19 +65,6 @@ BLOCKS = {
 }
 
 
-def test_updates_survive_the_wire() -> None:
-    path = np.arange(6, dtype=np.float32).reshape(2, 3)
-    message = encode(Update(path, BLOCKS))
-    size = feeds._HEADER.size
-    back = decode(message[:size], message[size:])
-    np.testing.assert_array_equal(back.path, path)
-    assert list(back.blocks) == list(BLOCKS)
-    for key, part in BLOCKS.items():
-        assert_same(back.blocks[key], part)
-    empty = encode(Update(path[:0], {}))
-    assert decode(empty[:size], empty[size:]).blocks == {}
-
-
 def test_a_delta_is_taken_apart_into_its_blocks() -> None:
     found = dict(patches(delta_of(BLOCKS)))
     assert set(found) == set(BLOCKS)
@@ -84,106 +72,61 @@ def test_a_delta_is_taken_apart_into_its_blocks() -> None:
         assert_same(found[key], part)
 
 
-class Viewer:
-    """Receives in a thread what a feed sends."""
+def test_a_run_tells_viewers_and_never_waits_for_them(tmp_path: Path) -> None:
+    class Mapped:
+        told_everything = 0
 
-    def __init__(self, path: Path) -> None:
-        self.updates: list[Update] = []
-        self.thread = threading.Thread(target=self._run, args=(path,), daemon=True)
-        self.thread.start()
+        def tell_everything(self) -> None:
+            self.told_everything += 1
 
-    def _run(self, path: Path) -> None:
-        for update in receive(path):
-            self.updates.append(update)
-
-
-def until(done: object, what: str) -> None:
-    end = time.monotonic() + 20
-    while not done():  # type: ignore[operator]
-        assert time.monotonic() < end, what
-        time.sleep(0.01)
-
-
-@pytest.fixture
-def feed(tmp_path: Path) -> object:
-    made = LiveFeed(tmp_path / "deep" / "view.sock", most_hz=50.0)
-    yield made
-    made.close()
-
-
-def test_a_viewer_sees_the_newest_state_of_every_block(feed: LiveFeed) -> None:
-    feed.publish(delta_of(BLOCKS))
-    assert feed.waiting == 0 and not feed.attached  # nobody looks: nothing is kept
-    viewer = Viewer(feed.path)
-    nothing = delta_of({(0, 0, 0): BLOCKS[0, 0, 0]})
-    until(lambda: (feed.publish(nothing), feed.attached)[1], "the viewer attaches")
-    for index in range(30):
-        newest = {(0, 0, 0): patch([5, 7, 9], [[5, 7, 9]], seed=index), (1, 0, 0): BLOCKS[1, 0, 0]}
-        pose = np.eye(4)
-        pose[0, 3] = index
-        feed.publish(delta_of(newest, index), pose)
-    until(lambda: (feed.pump(), feed.waiting == 0)[1], "everything is sent")
-    feed.close()
-    viewer.thread.join(20)
-    seen: dict[tuple[int, int, int], Patch] = {}
-    for update in viewer.updates:
-        seen |= update.blocks
+    mapper, path = Mapped(), tmp_path / "deep" / "view.sock"
+    with telling(ViewConfig(socket=str(path))) as live:
+        publish = live.watching(mapper)  # type: ignore[arg-type]
+        publish(delta_of(BLOCKS))
+        assert mapper.told_everything == 0 and path.stat().st_mode & 0o777 == 0o600
+        reader, seen = MapReader(path), {}
+        asleep = socket.socket(socket.AF_UNIX)
+        asleep.connect(str(path))
+        reader.take()
+        big = patch(list(range(200_000)), [])  # more than a socket takes at once
+        start = time.monotonic()
+        for index in range(20):
+            newest = {(0, 0, 0): patch([5, 7, 9], [[5, 7, 9]], seed=index), (9, 9, 9): big}
+            publish(delta_of(newest, index))
+        assert time.monotonic() - start < 5.0 and mapper.told_everything == 1
+        asleep.close()
+        end = time.monotonic() + 20.0
+        while (0, 0, 0) not in seen or not (seen[0, 0, 0].position == newest[0, 0, 0].position).all():
+            assert time.monotonic() < end
+            publish(delta_of({(1, 0, 0): BLOCKS[1, 0, 0]}))
+            for delta in reader.take():
+                seen |= dict(patches(delta))
+        reader.close()
+    assert not path.exists()
     assert_same(seen[0, 0, 0], newest[0, 0, 0])
-    assert_same(seen[1, 0, 0], BLOCKS[1, 0, 0])
-    path = np.concatenate([update.path for update in viewer.updates])
-    np.testing.assert_array_equal(path[:, 0], np.arange(30))
-    assert len(viewer.updates) < 30  # rate-capped
 
 
-def test_a_viewer_that_does_not_read_neither_blocks_nor_fills_memory(
-    feed: LiveFeed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(feeds, "_MOST_PENDING", 3 << 20)
-    monkeypatch.setattr(feeds, "_SEND_BUFFER", 1 << 14)
-    with socket.socket(socket.AF_UNIX) as asleep:
-        asleep.connect(str(feed.path))
-        for index in range(100):
-            many = patch(list(range(index * 5000, index * 5000 + 5000)), [])
-            feed.publish(delta_of({(index, 0, 0): many}))
-            if feed.let_go:
-                break
-        assert feed.let_go == 1 and feed.waiting == 0
-    feed.publish(delta_of(BLOCKS))
-
-
-def test_a_new_viewer_takes_the_place_of_the_old(feed: LiveFeed) -> None:
-    first = Viewer(feed.path)
-    until(lambda: (feed.publish(delta_of(BLOCKS)), feed.attached)[1], "the first")
-    feed.attached = False
-    second = Viewer(feed.path)
-    until(lambda: (feed.publish(delta_of(BLOCKS)), feed.attached)[1], "the second")
-    first.thread.join(20)
-    assert not first.thread.is_alive()
-    until(lambda: (feed.publish(delta_of(BLOCKS)), second.updates)[1], "an update")
-
-
-def test_sockets_that_are_none_are_told(tmp_path: Path, feed: LiveFeed) -> None:
+def test_sockets_that_are_none_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no map is growing"):
-        next(receive(tmp_path / "none"))
-    with pytest.raises(InputError, match="choose another"):
-        LiveFeed(feed.path)  # another run has it
-    (tmp_path / "left").touch()
-    with pytest.raises(InputError, match="choose another"):
-        LiveFeed(tmp_path / "left")
-    stale = socket.socket(socket.AF_UNIX)
-    stale.bind(str(tmp_path / "stale"))
-    stale.close()
-    LiveFeed(tmp_path / "stale").close()
+        map_socket(tmp_path / "none")
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="no socket"), telling(ViewConfig(socket=str(tmp_path / "file"))):
+        pass
+    with (
+        pytest.raises(InputError, match="cannot make"),
+        telling(ViewConfig(socket=f"{tmp_path}/{'x' * 200}")),
+    ):
+        pass
+    with telling(ViewConfig()) as live:
+        live.watching(None)(delta_of(BLOCKS))  # type: ignore[arg-type]
 
 
 def test_regions_join_blocks_by_the_names_of_vertices() -> None:
     mesh = LiveMesh()
-    mesh.apply(Update(np.zeros((1, 3), np.float32), {(0, 0, 0): BLOCKS[0, 0, 0]}))
+    mesh.apply(delta_of({(0, 0, 0): BLOCKS[0, 0, 0]}))
     assert mesh.take_dirty(9) == [(0, 0, 0)]
     assert len(mesh.region_mesh((0, 0, 0)).faces) == 1  # the neighbour's vertex is not known yet
-    mesh.apply(
-        Update(np.zeros((1, 3), np.float32), {(1, 0, 0): BLOCKS[1, 0, 0], (8, 0, 0): BLOCKS[-9, 3, 2]})
-    )
+    mesh.apply(delta_of({(1, 0, 0): BLOCKS[1, 0, 0], (8, 0, 0): BLOCKS[-9, 3, 2]}))
     assert mesh.take_dirty(1) == [(0, 0, 0)] and mesh.take_dirty(9) == [(2, 0, 0)]
     joined = mesh.region_mesh((0, 0, 0))
     corners = {tuple(sorted(map(tuple, joined.vertices[face].tolist()))) for face in joined.faces}
@@ -198,7 +141,7 @@ def test_regions_join_blocks_by_the_names_of_vertices() -> None:
     assert corners == expected and len(joined.vertices) == 6
     assert len(mesh.region_mesh((2, 0, 0)).faces) == 0 and len(mesh.region_mesh((5, 5, 5)).faces) == 0
     assert region_of((-1, 4, 3)) == (-1, 1, 0)
-    mesh.apply(Update(np.empty((0, 3), np.float32), {(1, 0, 0): patch([], [])}))  # and it may vanish again
+    mesh.apply(delta_of({(1, 0, 0): patch([], [])}))  # and it may vanish again
     assert len(mesh.region_mesh((0, 0, 0)).faces) == 1
 
 

@@ -3,62 +3,77 @@
 from __future__ import annotations
 
 import argparse
-import os
 import threading
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from artemis_edge.commands.common import DONE, command
 
+if TYPE_CHECKING:
+    from artemis_edge.view.live import LiveView
+
 _PORT = 8080
-
-
-def default_socket() -> Path:
-    """Where a run feeds its viewer unless told otherwise."""
-    return Path(os.environ.get("XDG_RUNTIME_DIR", "/tmp")) / "artemis-edge" / "view.sock"
 
 
 def add(commands: Any) -> None:
     """Declare it."""
     parser = command(commands, "view", run_view, "a map in the browser: a finished one, or one that grows")
     parser.add_argument(
-        "map", type=Path, nargs="?", metavar="MAP", help="an output directory or a mesh.ply; without: live"
-    )
+        "map", type=Path, nargs="?", metavar="MAP",
+        help="an output directory or a mesh.ply; without: the map that the service makes",
+    )  # fmt: skip
     parser.add_argument("--port", type=int, default=_PORT, metavar="N", help=f"default: {_PORT}")
     parser.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS",
         help="listen for other machines, too, on this address; they need the token that is printed",
     )  # fmt: skip
     parser.add_argument(
-        "--live", type=Path, default=None, metavar="SOCKET", help="feed of a run, as of its view.socket"
+        "--live", type=Path, metavar="SOCKET", help="the map of a run with this view.socket instead"
     )
 
 
 def run_view(given: argparse.Namespace) -> int:
     """``artemis-edge view``."""
-    if given.map is not None:
-        from artemis_edge.view.finished import FinishedView
-
-        finished = FinishedView(given.map, given.host, given.port)
-        _announce(finished.browser.url)
-        _wait(finished.browser)
+    if given.map is None:
+        live = _live_view(given)
+        print(f"open {live.browser.url} (stop with Ctrl-C)", flush=True)
+        try:
+            live.run()
+        except KeyboardInterrupt:
+            live.close()
         return DONE
-    from artemis_edge.view.live import LiveView
+    from artemis_edge.view.finished import FinishedView
 
-    live = LiveView(given.live or default_socket(), given.host, given.port)
-    _announce(live.browser.url)
-    live.run()
-    print("the run has ended; the map stays until you stop this command", flush=True)
-    _wait(live.browser)
-    return DONE
-
-
-def _announce(url: str) -> None:
-    print(f"open {url} (stop with Ctrl-C)", flush=True)
-
-
-def _wait(browser: Any) -> None:
+    finished = FinishedView(given.map, given.host, given.port)
+    print(f"open {finished.browser.url} (stop with Ctrl-C)", flush=True)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
-        browser.close()
+        finished.browser.close()
+    return DONE
+
+
+def _live_view(given: argparse.Namespace) -> LiveView:
+    from artemis_edge.service.control import default_path, viewers_path
+    from artemis_edge.service.map_feed import MapReader
+    from artemis_edge.view.live import LiveView, map_socket
+
+    if given.live is not None:
+        return LiveView(MapReader(map_socket(given.live)), given.host, given.port)
+    return LiveView(MapReader(map_socket(viewers_path(default_path()))), given.host, given.port, _ask_service)
+
+
+def _ask_service(text: str) -> Any:
+    from artemis_edge.errors import InputError
+    from artemis_edge.service.control import default_path
+    from artemis_edge.tui.remote import RemoteError
+    from artemis_edge.tui.socket_remote import SocketRemote
+    from artemis_edge.view.browser import Answer
+
+    remote = SocketRemote(default_path())
+    try:
+        return Answer(remote.ask(text))
+    except RemoteError as error:
+        raise InputError(str(error)) from None
+    finally:
+        remote.close()

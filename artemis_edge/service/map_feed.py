@@ -75,6 +75,9 @@ class MapFeed:
         before = os.umask(0o777 & ~mode)
         try:
             self._listener.bind(str(path))
+        except OSError:
+            self._listener.close()
+            raise
         finally:
             os.umask(before)
         self._listener.listen()
@@ -83,6 +86,11 @@ class MapFeed:
 
     def __len__(self) -> int:
         return len(self._viewers)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a viewer has not been told everything yet."""
+        return any(len(viewer.newest) or viewer.unsent for viewer in self._viewers)
 
     def add(self, delta: MeshDelta) -> None:
         """News for all viewers."""

@@ -4,82 +4,90 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from artemis_edge.view.browser import Browser
-from artemis_edge.view.feed import BlockKey, receive
+from artemis_edge.errors import InputError
+from artemis_edge.export.mesh import Mesh
+from artemis_edge.frames import MeshDelta
+from artemis_edge.view.browser import Ask, Browser
 from artemis_edge.view.kinds import Kind, coloured
-from artemis_edge.view.live_mesh import LiveMesh, extent
+from artemis_edge.view.live_mesh import BlockKey, LiveMesh, extent
 
 # A browser on a tablet redraws this often, and takes this many regions each time: newest state wins.
 _EVERY_S, _REGIONS_AT_ONCE = 0.5, 12
 
 
-class LiveView:
-    """Serves the map that grows at the other end of ``socket`` until closed or the run ends."""
+class Source(Protocol):
+    """Where news of a growing map comes from: ``service.map_feed.MapReader``."""
 
-    def __init__(self, socket: Path, host: str, port: int) -> None:
+    def take(self) -> list[MeshDelta]:
+        """What has arrived, without waiting."""
+        ...
+
+    def close(self) -> None:
+        """Detach."""
+        ...
+
+
+class LiveView:
+    """Serves the map that ``source`` tells of until closed; ``ask`` answers the query box, if there is one."""
+
+    def __init__(self, source: Source, host: str, port: int, ask: Ask | None = None) -> None:
+        self._source = source
         self._mesh = LiveMesh()
-        self._lock = threading.Lock()
+        self._drawing = threading.Lock()
         self._ended = threading.Event()
         self._nodes: dict[BlockKey, Any] = {}
-        self._fault: BaseException | None = None
-        updates = receive(socket)
-        self._first = next(updates, None)
-        self.browser = Browser(host, port, self._recolour)
-        self._note = self.browser.note()
         self._looked = False
-        self._reader = threading.Thread(target=self._read, args=(updates,), daemon=True, name="feed")
-        self._reader.start()
+        self.browser = Browser(host, port, self._recolour)
+        if ask is not None:
+            self.browser.add_query(ask, lambda triangles: None)
+        self._note = self.browser.note()
+        self._note.content = "waiting for the map"
 
     def run(self) -> None:
-        """Draw until the feed ends; then what remains, once. Raises what the feed raised."""
+        """Draw what comes until ``close``."""
         while not self._ended.wait(_EVERY_S):
-            self.draw(_REGIONS_AT_ONCE)
-        while self.draw(_REGIONS_AT_ONCE):
-            pass
-        if self._fault is not None:
-            raise self._fault
+            self.turn()
 
-    def draw(self, most: int) -> bool:
-        """Draw at most so many regions that changed; whether there were any."""
-        with self._lock:
+    def turn(self, most: int = _REGIONS_AT_ONCE) -> None:
+        """Take the news and draw at most so many regions that changed."""
+        with self._drawing:
+            for delta in self._source.take():
+                self._mesh.apply(delta)
             regions = self._mesh.take_dirty(most)
-            meshes = [(region, self._mesh.region_mesh(region)) for region in regions]
-            path, blocks = self._mesh.path, len(self._mesh.blocks)
-            if not self._looked and len(self._mesh.blocks):
-                self.browser.look_at(*extent(path, self._mesh.blocks))
+            for region in regions:
+                self._draw(region, self.browser.kind)
+            if regions:
+                self._note.content = f"{len(self._mesh.blocks):,} blocks"
+            if regions and not self._looked:
+                self.browser.look_at(*extent(self._mesh.blocks))
                 self._looked = True
-        for region, mesh in meshes:
-            self._nodes[region] = self._replace(region, coloured(mesh, self.browser.kind))
-        if meshes:
-            self.browser.set_path(path)
-            state = "ended" if self._ended.is_set() else "growing"
-            self._note.content = f"{state}: {blocks:,} blocks, {len(path):,} poses"
-        return bool(meshes)
 
-    def _replace(self, region: BlockKey, mesh: Any) -> Any:
-        name = "/map/" + "_".join(str(k) for k in region)
-        node = self.browser.set_mesh(name, mesh)
-        if node is None and self._nodes.get(region) is not None:
-            self._nodes[region].remove()
-        return node
+    def close(self) -> None:
+        """Stop serving and detach."""
+        self._ended.set()
+        with self._drawing:
+            self._source.close()
+            self.browser.close()
 
     def _recolour(self, kind: Kind) -> None:
-        with self._lock:
-            meshes = [(region, self._mesh.region_mesh(region)) for region in self._nodes]
-        for region, mesh in meshes:
-            self._nodes[region] = self._replace(region, coloured(mesh, kind))
+        with self._drawing:
+            for region in list(self._nodes):
+                self._draw(region, kind)
 
-    def _read(self, updates: Any) -> None:
-        try:
-            if self._first is not None:
-                with self._lock:
-                    self._mesh.apply(self._first)
-            for update in updates:
-                with self._lock:
-                    self._mesh.apply(update)
-        except BaseException as fault:  # told by run(), in the main thread
-            self._fault = fault
-        finally:
-            self._ended.set()
+    def _draw(self, region: BlockKey, kind: Kind) -> None:
+        mesh: Mesh = coloured(self._mesh.region_mesh(region), kind)
+        before = self._nodes.get(region)
+        self._nodes[region] = self.browser.set_mesh("/map/" + "_".join(str(k) for k in region), mesh)
+        if self._nodes[region] is None and before is not None:
+            before.remove()
+
+
+def map_socket(path: Path) -> Path:
+    """``path`` if a run tells its map there; InputError if not."""
+    if not path.is_socket():
+        raise InputError(
+            f"no map is growing at {path}; start `artemis-edge run`, or map with --set view.socket={path}"
+        )
+    return path

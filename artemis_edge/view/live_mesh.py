@@ -2,29 +2,61 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 
 from artemis_edge.export.mesh import Mesh, bare_mesh
-from artemis_edge.frames import F32, I32, I64
-from artemis_edge.view.feed import BlockKey, Patch, Update
+from artemis_edge.frames import F32, I32, I64, U8, MeshDelta
 
 #: Blocks along an edge of a region: few enough objects for a browser, small enough to send again when one changes.
 REGION_BLOCKS = 4
 
+BlockKey = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """What one block shows: arrays as in ``MeshDelta``."""
+
+    vertex_id: I64
+    position: F32
+    colour: U8
+    label: U8
+    confidence: F32
+    triangles: I64
+
+
+def patches(delta: MeshDelta) -> Iterator[tuple[BlockKey, Patch]]:
+    """The blocks of a delta."""
+    for k, (x, y, z) in enumerate(delta.block.tolist()):
+        v = slice(delta.vertex_start[k], delta.vertex_start[k + 1])
+        t = slice(delta.triangle_start[k], delta.triangle_start[k + 1])
+        yield (
+            (x, y, z),
+            Patch(
+                delta.vertex_id[v],
+                delta.position[v],
+                delta.colour[v],
+                delta.label[v],
+                delta.confidence[v],
+                delta.triangles[t],
+            ),
+        )
+
 
 class LiveMesh:
-    """Takes updates; ``take_dirty`` names regions to draw again, the ones that wait longest first."""
+    """Takes deltas; ``take_dirty`` names regions to draw again, the ones that wait longest first."""
 
     def __init__(self) -> None:
         self.blocks: dict[BlockKey, Patch] = {}
-        self.path = np.empty((0, 3), np.float32)
         self._regions: dict[BlockKey, set[BlockKey]] = {}
         self._dirty: dict[BlockKey, None] = {}
 
-    def apply(self, update: Update) -> None:
-        """Replace the blocks of an update."""
-        self.path = np.concatenate([self.path, update.path])
-        for key, patch in update.blocks.items():
+    def apply(self, delta: MeshDelta) -> None:
+        """Replace the blocks of a delta."""
+        for key, patch in patches(delta):
             self.blocks[key] = patch
             self._regions.setdefault(region_of(key), set()).add(key)
             # a triangle of the neighbouring block may use a vertex of this one
@@ -82,8 +114,8 @@ def _rows(ids: I64, triangles: I64) -> I32:
     return rows
 
 
-def extent(path: F32, blocks: dict[BlockKey, Patch]) -> tuple[F32, F32]:
+def extent(blocks: dict[BlockKey, Patch]) -> tuple[F32, F32]:
     """Lowest and highest corner (3,) of what is known, for a first look."""
-    points = [path, *(part.position for part in blocks.values())]
-    everything = np.concatenate([p for p in points if len(p)] or [np.zeros((1, 3), np.float32)])
+    points = [part.position for part in blocks.values() if len(part.position)]
+    everything = np.concatenate(points or [np.zeros((1, 3), np.float32)])
     return everything.min(axis=0), everything.max(axis=0)

@@ -26,6 +26,7 @@ _OPTIONS = [
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", "--remote-debugging-port=0",
 ]  # fmt: skip
 _PATIENCE_S = 120.0
+_BUSY = -32000  # the protocol's answer while there is no page to ask
 
 
 class _Quiet(SimpleHTTPRequestHandler):
@@ -56,16 +57,24 @@ class Page:
         self._socket, self._number = socket, 0
 
     def call(self, method: str, **given: Any) -> dict[str, Any]:
-        """A command of the DevTools protocol and its result."""
+        """A command of the DevTools protocol and its result; while a page is being replaced, asked again."""
+        end = time.monotonic() + _PATIENCE_S
+        while True:
+            answer = self._ask(method, given)
+            if "error" not in answer:
+                result: dict[str, Any] = answer["result"]
+                return result
+            assert answer["error"]["code"] == _BUSY and time.monotonic() < end, answer
+            time.sleep(0.2)
+
+    def _ask(self, method: str, given: dict[str, Any]) -> dict[str, Any]:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": given}))
         while True:
-            message = json.loads(self._socket.recv(timeout=_PATIENCE_S))
+            message: dict[str, Any] = json.loads(self._socket.recv(timeout=_PATIENCE_S))
             self._note(message)
             if message.get("id") == self._number:
-                assert "error" not in message, message
-                result: dict[str, Any] = message["result"]
-                return result
+                return message
 
     def evaluate(self, expression: str) -> Any:
         """Value of an expression in the page."""

@@ -1,17 +1,22 @@
 """The browser view in headless Chromium without a network: a finished map, a growing one, the token."""
 
+import itertools
 import json
 import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from artemis_edge.config import ViewConfig
 from artemis_edge.export.atlas import write_atlas
 from artemis_edge.export.ply import write_ply
-from artemis_edge.view.feed import LiveFeed, Patch
+from artemis_edge.service.map_feed import MapReader
+from artemis_edge.telling import Telling, telling
+from artemis_edge.view.live_mesh import Patch
 from tests.test_view import delta_of
 from tests.textured import square_room
 from tests.viewer.browser import CHROMIUM, Page, page
@@ -86,7 +91,7 @@ def test_a_finished_map_with_texture_query_and_colours_offline(room: Path) -> No
 
 
 def test_a_growing_map_appears_while_it_grows(tmp_path: Path) -> None:
-    from artemis_edge.view.live import LiveView
+    from artemis_edge.view.live import LiveView, map_socket
 
     mesh, _ = square_room()
     colours = np.tile(np.array([[30, 160, 220]], np.uint8), (len(mesh.vertices), 1))
@@ -97,35 +102,31 @@ def test_a_growing_map_appears_while_it_grows(tmp_path: Path) -> None:
         )
         for k in range(5)
     ]  # fmt: skip
-    feed = LiveFeed(tmp_path / "view.sock")
     stop = threading.Event()
+    path = tmp_path / "view.sock"
 
-    def pipeline() -> None:
-        told = 0
-        while not stop.wait(0.1):
-            told = 0 if feed.attached else told
-            feed.attached = False
-            pose = np.eye(4)
-            pose[0, 3] = 0.1 * told
-            feed.publish(delta_of({(told % 5, 0, 0): walls[told % 5]}), pose)
-            told += 1
-        feed.close()
+    def pipeline(live: Telling) -> None:
+        publish = live.watching(SimpleNamespace(tell_everything=lambda: None))  # type: ignore[arg-type]
+        for told in itertools.count():
+            if stop.wait(0.1):
+                return
+            publish(delta_of({(told % 5, 0, 0): walls[told % 5]}))
 
-    run = threading.Thread(target=pipeline, daemon=True)
-    run.start()
-    view = LiveView(feed.path, "127.0.0.1", 0)
-    drawing = threading.Thread(target=view.run, daemon=True)
-    drawing.start()
-    try:
-        with page(view.browser.url, tmp_path, WIDTH, HEIGHT) as shown:
-            settled(shown, lambda s: ((s[..., 2] - s[..., 0]) > 60).mean() > 0.1, "the map")
-            shown.until(lambda: "growing: 5 blocks" in shown.evaluate("document.body.innerText"), "the state")
+    with telling(ViewConfig(socket=str(path))) as live:
+        run = threading.Thread(target=pipeline, args=(live,), daemon=True)
+        run.start()
+        view = LiveView(MapReader(map_socket(path)), "127.0.0.1", 0)
+        drawing = threading.Thread(target=view.run, daemon=True)
+        drawing.start()
+        try:
+            with page(view.browser.url, tmp_path, WIDTH, HEIGHT) as shown:
+                settled(shown, lambda s: ((s[..., 2] - s[..., 0]) > 60).mean() > 0.1, "the map")
+                shown.until(lambda: "5 blocks" in shown.evaluate("document.body.innerText"), "the state")
+        finally:
+            view.close()
+            drawing.join(20)
             stop.set()
-            shown.until(lambda: "ended: 5 blocks" in shown.evaluate("document.body.innerText"), "the end")
-    finally:
-        stop.set()
-        view.browser.close()
-    drawing.join(20)
+            run.join(20)
     assert not drawing.is_alive()
 
 
