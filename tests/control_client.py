@@ -8,7 +8,7 @@ from typing import Any
 def ask(path: object, **request: Any) -> dict[str, Any]:
     """One request on a connection of its own; the answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
-        sock.settimeout(10.0)
+        sock.settimeout(40.0)
         sock.connect(str(path))
         sock.sendall(json.dumps({"v": 1, "id": 1, **request}).encode() + b"\n")
         data = b""

@@ -90,7 +90,7 @@ def test_subscribers_get_states_and_events_and_never_hold_others_up(control: Con
     for sock in (deaf, keen):
         sock.sendall(b'{"do":"subscribe","every_s":0.05}\n')
     first, second = _lines(keen, 2)
-    assert first["result"] == {"every_s": 0.05} and second["event"] == "state"
+    assert first["result"] == {"every_s": 0.05} and second["event"] == "status"
     ask(control.path, do="shout")
     assert ask(control.path, do="echo", text="still here")["ok"]
     assert any(line["event"] == "event" for line in _lines(keen, 20))

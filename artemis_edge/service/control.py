@@ -70,7 +70,7 @@ class ControlSocket:
                 if client.unsent:  # newest state wins: it gets the next one
                     self.skipped += 1
                     continue
-                told = told or {"v": VERSION, "event": "state", "data": state()}
+                told = told or {"v": VERSION, "event": "status", "data": state()}
                 self._say(client, told)
         for client in [*self._clients]:
             self._push(client)

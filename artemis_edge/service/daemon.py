@@ -20,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import msgspec
 from artemis_drivers.base import DriverError, State
 from artemis_drivers.trigger.messages import Opcode
 from artemis_drivers.udp import Interface, interfaces
@@ -33,10 +34,12 @@ from artemis_edge.service.notify import Notifier
 from artemis_edge.service.outlet import Outlet
 from artemis_edge.service.rig import Rig, make_rig
 from artemis_edge.service.settings import RunConfig
+from artemis_edge.service.status_view import StatusView
 from artemis_edge.session.files import NAME
 from artemis_edge.session.message_ring import MessageRing
 
 _TURN_S = 0.05
+_STATE_AGE_S = 0.1
 _CAPTURE_STALE_S = 1.0  # a thread that turns a hundred times a second
 _RECORDER_STALE_S = 4.0
 _MAPPER_STALE_S = 20.0  # it may be in a long frame, and saving a large map it says nothing
@@ -99,6 +102,7 @@ class Daemon:
         self._marks = _Marks()
         self._ended_sessions: list[dict[str, Any]] = []
         self._signals = 0
+        self._known: tuple[float, dict[str, Any]] | None = None
         self._quit = False
         self._checking_s = 0.0
         self._folder: Path | None = None
@@ -109,6 +113,7 @@ class Daemon:
             raise InputError(str(error)) from None
         self.outlet = Outlet(MessageRing.create(config.service.ring_mb))
         self.capture = Capture(self.rig, self.outlet)
+        self._view = StatusView(config)
         self.control = ControlSocket(
             control_path(config.service.socket), int(config.service.socket_mode, 8), self._answer
         )
@@ -150,7 +155,7 @@ class Daemon:
                 return
 
     def _turn(self) -> None:
-        self.control.turn(self.state, _TURN_S)
+        self.control.turn(self._told, _TURN_S)
         if self.capture.fault is not None and self.phase != Phase.FAULT:
             self._fail(f"the capture thread ended: {self.capture.fault}")
         self._buttons()
@@ -162,6 +167,7 @@ class Daemon:
                 self._end_session()
             if self.session.over:
                 self._close_session(self.session)
+        self._view.look(self.capture.health())
         self._notify.status(self._sentence())
         if self._alive():
             self._notify.beat()
@@ -280,6 +286,7 @@ class Daemon:
         if phase == self.phase:
             return
         self.phase = phase
+        self._known = None
         self._tell({"kind": "state", "state": str(phase)})
         if self.rig.board is not None:
             self.rig.board.command(Opcode.INDICATE, _LED[phase], _BUZZER.get(phase, 0))
@@ -319,7 +326,13 @@ class Daemon:
         return session.mapper is None or now - session.mapper.heard_s <= _MAPPER_STALE_S
 
     def state(self) -> dict[str, Any]:
-        """Everything a client shows."""
+        """Everything a client may want to know, a tenth of a second old at most, however often it is asked."""
+        now = time.monotonic()
+        if self._known is None or now - self._known[0] > _STATE_AGE_S:
+            self._known = now, self._state()
+        return self._known[1]
+
+    def _state(self) -> dict[str, Any]:
         capture, session = self.capture, self.session
         folder = session.folder if session is not None else Path(self.config.service.sessions)
         free_mb = health.free_disk_mb(folder)
@@ -361,12 +374,18 @@ class Daemon:
             "cpu_s": round(time.process_time(), 2),
         }
 
+    def _told(self) -> dict[str, Any]:
+        """What subscribers get."""
+        return dict(msgspec.to_builtins(self._view.status(self.state(), self.capture.health())))
+
     def _answer(self, what: str, request: dict[str, Any]) -> dict[str, Any]:
         """A request of a client."""
         if what == "hello":
             return {"service": "artemis-edge", "version": metadata.version("artemis-edge"), "protocol": 1}
-        if what == "status":
+        if what == "state":
             return self.state()
+        if what == "status":
+            return self._told()
         if what == "start":
             return self._asked_to_start(request)
         if what == "stop":
@@ -387,7 +406,7 @@ class Daemon:
             self._quit = True
             return {"phase": str(self.phase)}
         raise InputError(
-            f"no request '{what[:40]}'; there are hello, status, start, stop, mark, subscribe, quit"
+            f"no request '{what[:40]}'; there are hello, status, state, start, stop, mark, subscribe, quit"
         )
 
     def _asked_to_start(self, request: dict[str, Any]) -> dict[str, Any]:

@@ -133,6 +133,7 @@ class LiveMapper:
         self.mapping.keeper.after_copy()
         if self.viewers is not None:
             self.viewers.forget_viewers()
+        self.channel.forget()
 
     def _say(self, state: str, *, force: bool = False, resumed: bool = False) -> None:
         now = time.monotonic()

@@ -9,6 +9,7 @@ import time
 from collections.abc import Mapping
 
 _SECOND_US = 1_000_000
+_STATUS_S = 1.0
 
 
 class Notifier:
@@ -21,6 +22,7 @@ class Notifier:
         period = environment.get("WATCHDOG_USEC", "")
         self.beat_s = int(period) / _SECOND_US / 2 if period.isdecimal() and int(period) and ours else None
         self._beaten = float("-inf")
+        self._stated = float("-inf")
         self._status = ""
 
     def ready(self) -> None:
@@ -28,9 +30,10 @@ class Notifier:
         self._send("READY=1")
 
     def status(self, sentence: str) -> None:
-        """One line for people, sent when it is another one."""
-        if sentence != self._status:
-            self._status = sentence
+        """One line for people, sent when it is another one, once a second at most."""
+        now = time.monotonic()
+        if sentence != self._status and now - self._stated >= _STATUS_S:
+            self._status, self._stated = sentence, now
             self._send(f"STATUS={sentence}")
 
     def beat(self) -> None:
@@ -52,4 +55,5 @@ class Notifier:
         if not self._address:
             return
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
-            sock.sendto(text.encode(), self._address)
+            # systemd may be busy: this service is not to wait for it
+            sock.sendto(text.encode(), socket.MSG_DONTWAIT, self._address)

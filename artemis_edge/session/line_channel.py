@@ -29,6 +29,11 @@ class LineChannel:
         self._out += json.dumps(line, separators=(",", ":")).encode() + b"\n"
         self.push()
 
+    def forget(self) -> None:
+        """In a copy of the process: what is half said belongs to the other."""
+        self._in.clear()
+        self._out.clear()
+
     def push(self) -> None:
         """Send what is waiting."""
         while self._out and not self.closed:

@@ -53,6 +53,7 @@ def to_frame(message: Any, jpeg_quality: int = 0) -> CameraFrame:
         colours = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if encoding == "rgb8" else pixels
         data = cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()
         encoding = "jpeg"
+    temperature = message.getSensorTemperature()
     return CameraFrame(
         int(message.getSequenceNum()),
         nanoseconds(message.getTimestampDevice()),
@@ -62,7 +63,7 @@ def to_frame(message: Any, jpeg_quality: int = 0) -> CameraFrame:
         encoding,
         data,
         message.getSensitivity() / _ISO_OF_GAIN_1,
-        float(message.getSensorTemperature()) if hasattr(message, "getSensorTemperature") else float("nan"),
+        float("nan") if temperature is None else float(temperature),
     )
 
 

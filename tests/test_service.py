@@ -1,0 +1,194 @@
+"""The service end to end, against virtual devices on the wire: recorded, mapped, killed, stopped, replayed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from artemis_edge import topics
+from artemis_edge.service.control import default_path
+from artemis_edge.session.feed import messages
+from artemis_edge.session.replay import replay
+from artemis_edge.session.verify import verify
+from artemis_edge.session.wire_replay import WireRig, read
+from tests import small_session
+from tests.control_client import ask
+from tests.livox_ports import reserved
+from tests.waiting import until
+
+_PATIENCE_S = 90.0
+_PICTURES = topics.CAMERA_IMAGE.name
+
+
+class _Service:
+    """The command in a process of its own, and what it says to a socket in systemd's place."""
+
+    def __init__(self, rig: WireRig, session: Path, tmp: Path) -> None:
+        self.path = rig.folder / "control"
+        self.notified: list[str] = []
+        self._notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._notify.bind(str(tmp / "notify"))
+        self._notify.setblocking(False)
+        self.log = (tmp / "log").open("w+")
+        words = ["run", "--config", str(rig.folder / "rig.toml"), "--session", str(session)]
+        environment = {"NOTIFY_SOCKET": str(tmp / "notify"), "WATCHDOG_USEC": "2000000"}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "artemis_edge.cli", *words],
+            env={**os.environ, **environment},
+            stderr=self.log,
+        )
+
+    def state(self) -> dict[str, Any]:
+        self.heard()
+        return dict(ask(self.path, do="state")["result"])
+
+    def listens(self) -> bool:
+        return "READY=1" in self.heard() and self.process.poll() is None
+
+    def heard(self) -> list[str]:
+        try:
+            while True:
+                self.notified.append(self._notify.recv(4096).decode())
+        except BlockingIOError:
+            return self.notified
+
+    def end(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self.log.close()
+        self._notify.close()
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, _Service, dict[str, Any]]]:
+    """One run for all: a walk of two seconds, the mapping killed in the middle of it."""
+    tmp = tmp_path_factory.mktemp("run")
+    walk = read(small_session.write(tmp / "walk", frames=25, points=3000))
+    session, seen = tmp / "recorded", dict[str, Any]()
+    with reserved(), WireRig(walk, tmp / "rig") as rig:
+        service = _Service(rig, session, tmp)
+        try:
+            assert until(service.listens, _PATIENCE_S, 0.2), _log(service)
+            assert until(lambda: _mapped(service) > 3, _PATIENCE_S, 0.2), _log(service)
+            seen["status"] = ask(service.path, do="status")["result"]
+            ask(service.path, do="mark", text="here")
+            rig.begin(0.5)
+            before = _mapped(service)
+            assert until(lambda: _mapped(service) > before + 8, _PATIENCE_S, 0.2)
+            seen["killed_at"] = _mapped(service)
+            os.kill(service.state()["session"]["mapping"]["pid"], signal.SIGKILL)
+            assert until(lambda: service.state()["session"]["mapping_restarts"] == 1, _PATIENCE_S, 0.2)
+            assert rig.over.wait(_PATIENCE_S)
+            assert until(lambda: _mapped(service) >= seen["killed_at"], _PATIENCE_S, 0.2)
+            seen["state"] = service.state()
+            seen["wire"] = dict(rig.avia.counters)
+            service.process.send_signal(signal.SIGTERM)
+            seen["code"] = service.process.wait(_PATIENCE_S)
+            service.heard()
+            yield session, service, seen
+        finally:
+            service.end()
+
+
+def _mapped(service: _Service) -> int:
+    state = service.state()
+    return int(((state["session"] or {}).get("mapping") or {}).get("frames", 0))
+
+
+def _log(service: _Service) -> str:
+    service.log.flush()
+    service.log.seek(0)
+    return service.log.read()
+
+
+def test_it_ends_well_and_tells_systemd(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+    _, service, seen = played
+    assert seen["code"] == 0, _log(service)
+    said = service.heard()
+    assert said[0] == "READY=1" and "STOPPING=1" in said
+    assert said.count("WATCHDOG=1") > 2 and any(line.startswith("EXTEND_TIMEOUT") for line in said)
+    assert any(line.startswith("STATUS=recording") for line in said)
+    assert not service.path.exists()
+
+
+def test_nothing_recorded_is_lost_by_the_death_of_the_mapping(
+    played: tuple[Path, _Service, dict[str, Any]],
+) -> None:
+    session, _, seen = played
+    assert [verdict.problems for verdict in verify(session)] == [[]]
+    numbers = []
+    with (session / "session_000.mcap").open("rb") as stream:
+        numbers = [
+            message.sequence for _, _, message in make_reader(stream).iter_messages(log_time_order=False)
+        ]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert (
+        seen["state"]["session"]["recorder"]["lost"] == seen["state"]["session"]["recorder"]["left_out"] == 0
+    )
+    assert seen["state"]["session"]["mapping"]["missed"] == 0
+
+
+def test_replay_equals_live(played: tuple[Path, _Service, dict[str, Any]], tmp_path: Path) -> None:
+    """Byte for byte, although the live mapping died in the middle."""
+    session, _, _ = played
+    replay(session, tmp_path / "replayed")
+    for name in ("mesh.ply", "trajectory.tum", "map/blocks.bin"):
+        live, again = session / "result" / name, tmp_path / "replayed" / name
+        assert live.read_bytes() == again.read_bytes(), name
+
+
+def test_the_session_holds_what_it_should(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+    session, _, _ = played
+    (verdict,) = verify(session)
+    expected = [topics.LIDAR_POINTS, topics.IMU, topics.CAMERA_STAMP, topics.CLOCKS]
+    for name in [*expected, topics.LIDAR_PACKETS, topics.IMU_BYTES, topics.CAN_FRAMES]:
+        assert verdict.topics[name.name] > 0, name
+    assert verdict.topics[_PICTURES] == verdict.topics["/camera/exposure"] > 10
+    events = [message for message in messages(session) if message.topic == topics.EVENTS.name]
+    assert any(b'"mark"' in message.data and b"here" in message.data for message in events)
+    assert any(b"mapping_restarted" in message.data for message in events)
+
+
+def test_other_libraries_read_it(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+    session, _, _ = played
+    (verdict,) = verify(session)
+    with AnyReader([session / "session_000.mcap"]) as bag:
+        counts = {connection.topic: connection.msgcount for connection in bag.connections}
+        stamps = [
+            bag.deserialize(raw, connection.msgtype).header.stamp
+            for connection, _, raw in bag.messages()
+            if connection.topic == topics.LIDAR_POINTS.name
+        ]
+    assert counts == dict(verdict.topics)
+    nanoseconds = [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
+    assert all(stamp % 10**8 == 0 for stamp in nanoseconds), "windows begin at whole tenths of session time"
+    assert abs(nanoseconds[-1] / 1e9 - time.time()) < 600
+    with (session / "session_000.mcap").open("rb") as stream:
+        decoded = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    assert len(decoded) == verdict.messages
+
+
+def test_clients_see_everything(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+    _, _, seen = played
+    status = seen["status"]
+    assert status["state"] == "recording" and status["frames"] > 3
+    assert {stream["name"] for stream in status["streams"]} == {"lidar_0", "imu", "cam_0", "trigger"}
+    state = seen["state"]
+    assert state["phase"] == "recording" and state["fault"] == ""
+    assert state["pairing"]["cam_0"]["paired"] > 10
+    assert json.loads(json.dumps(state)) == state
+    assert default_path().name == "artemis.sock"
