@@ -8,7 +8,7 @@ LEARNT ?= train-out
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint bench soak viewer-test train clean
+.PHONY: help setup demo test lint bench soak viewer-test train install-service clean
 
 help:
 	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
@@ -18,6 +18,7 @@ help:
 	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
 	@echo "make viewer-test  GLB and browser view in headless Chromium (fetches three.js with npm)"
 	@echo "make train   render views of the virtual worlds, train and export the shipped network (an hour or two, torch)"
+	@echo "make install-service   as root: the systemd service and what belongs to it (docs/operator.md)"
 	@echo "make setup   only create $(VENV); every target does it when needed"
 	@echo "make clean   remove $(VENV) and everything that was generated"
 
@@ -64,6 +65,23 @@ train: $(READY)
 	@$(BIN)/python training/export.py --weights $(LEARNT)/weights.pt --calibrate $(LEARNT)/calibrate \
 	  --out artemis_edge/segmentation/shipped
 	@$(BIN)/python training/score.py --views $(LEARNT)/judge
+
+# As root, from a checkout at /opt/artemis-edge. ROOT is for packagers and for trying it out.
+ROOT ?=
+install-service: $(READY)
+	@test "$(CURDIR)" = /opt/artemis-edge -o -n "$(ROOT)" || \
+	  { echo "the unit starts /opt/artemis-edge/.venv/bin/artemis-edge: move the checkout there first"; exit 2; }
+	@test -n "$(ROOT)" || id artemis >/dev/null 2>&1 || \
+	  useradd --system --home-dir /var/lib/artemis --shell /usr/sbin/nologin artemis
+	@install -D -m 644 -t $(ROOT)/etc/systemd/system systemd/artemis-edge.service systemd/artemis-can0.service
+	@install -D -m 644 -t $(ROOT)/etc/sysctl.d systemd/60-artemis.conf
+	@install -D -m 644 -t $(ROOT)/etc/systemd/network systemd/20-artemis-lidar.network
+	@install -D -m 644 -t $(ROOT)/etc/udev/rules.d firmware_cfg/udev/99-artemis.rules
+	@test -e $(ROOT)/etc/artemis/rig.toml || { mkdir -p $(ROOT)/etc/artemis && \
+	  { cat firmware_cfg/profiles/field.toml; printf '\n[service]\nrecord_at_start = false\n'; } >$(ROOT)/etc/artemis/rig.toml; }
+	@test -n "$(ROOT)" || { systemctl daemon-reload; sysctl -q --system; udevadm control --reload; }
+	@echo "edit /etc/artemis/rig.toml, name the LiDAR's port in /etc/systemd/network/20-artemis-lidar.network, then:"
+	@echo "  systemctl enable --now artemis-can0 artemis-edge"
 
 clean:
 	@rm -rf $(VENV) $(OUT) $(LEARNT) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -97,7 +97,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, _Se
             seen["state"] = service.state()
             seen["wire"] = dict(rig.avia.counters)
             service.process.send_signal(signal.SIGTERM)
-            seen["code"] = service.process.wait(_PATIENCE_S)
+            seen["code"] = service.process.wait(3 * _PATIENCE_S)
             service.heard()
             yield session, service, seen
         finally:

@@ -402,6 +402,8 @@ class Daemon:
             if self.phase != Phase.RECORDING:
                 raise InputError(f"a mark belongs to a recording: the service is {self.phase}")
             return {"number": self._mark(text)}
+        if what in ("ask", "forget"):
+            raise InputError("live questions are not answered yet; 'artemis-edge ask' asks the finished map")
         if what == "quit":
             self._quit = True
             return {"phase": str(self.phase)}
