@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from artemis_edge._jit import njit
 from artemis_edge.frames import F64
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.scan_motion import ScanMotion, through, times
@@ -53,50 +54,64 @@ class Path(NamedTuple):
 
     def at(self, state: State, time_s: float) -> PoseAt:
         """The LiDAR at a time by a state (at the stamp of the path's end), and how the state's error moves it."""
-        T, velocity, rate, arm = self._body(state, time_s)
-        R = T[:3, :3]
-        n = len(state)
-        dR = R.T @ state.T_world_body[:3, :3]
-        turned, moved = np.zeros((3, n)), np.zeros((3, n))
-        turned[:, ROTATION] = dR
+        T, velocity, rate, arm = (values[0] for values in self._bodies(state, np.array([time_s])))
+        R, skew_origin = T[:3, :3], se3.skew(self.origin)
+        turned, moved = np.zeros((3, len(state))), np.zeros((3, len(state)))
+        turned[:, ROTATION] = R.T @ state.T_world_body[:3, :3]
         moved[:, POSITION] = np.eye(3)
         moved[:, VELOCITY] = time_s * np.eye(3)
         moved[:, GRAVITY] = 0.5 * time_s**2 * np.eye(3)
-        moved -= R @ se3.skew(arm + self.origin) @ turned
-        T_world_lidar = T.copy()
-        T_world_lidar[:3, 3] += R @ self.origin
-        twist = np.concatenate([R.T @ velocity + np.cross(rate, self.origin), rate])
-        return PoseAt(T_world_lidar, twist, np.vstack([R.T @ moved, turned]))
+        moved -= R @ (se3.skew(arm) + skew_origin) @ turned
+        T[:3, 3] += R @ self.origin
+        twist = np.concatenate([R.T @ velocity - skew_origin @ rate, rate])
+        return PoseAt(T, twist, np.vstack([R.T @ moved, turned]))
 
     def motion(self, state: State, first_s: float, last_s: float) -> ScanMotion:
         """The LiDAR's motion over a window, referred to its pose at the state's stamp."""
-        T_lidar_world = se3.inverse(self.at(state, 0.0).T_world_lidar)
         ends = times(first_s, last_s)
-        poses = np.empty((len(ends), 4, 4))
-        for k, t in enumerate(ends):
-            poses[k] = self._body(state, float(t))[0]
-            poses[k, :3, 3] += poses[k, :3, :3] @ self.origin
-        return through(ends, T_lidar_world @ poses)
+        poses = self._bodies(state, np.append(ends, 0.0))[0]
+        poses[:, :3, 3] += poses[:, :3, :3] @ self.origin
+        return through(ends, se3.inverse(poses[-1]) @ poses[:-1])
 
-    def _nominal(self, time_s: float) -> tuple[F64, F64, F64]:
-        """T_world_body, velocity and turn rate as propagated; the first and last piece go on beyond the ends."""
-        k = max(int(np.searchsorted(self.time_s, time_s, "right")) - 1, 0)
-        t = time_s - self.time_s[k]
-        turn = np.zeros(6)
-        turn[3:] = t * self.turn_rate[k]
-        T: F64 = self.T_world_body[k] @ se3.exp(turn)
-        T[:3, 3] = self.T_world_body[k, :3, 3] + t * self.velocity[k] + 0.5 * t * t * self.acceleration[k]
-        return T, self.velocity[k] + t * self.acceleration[k], self.turn_rate[k]
+    def _bodies(self, state: State, time_s: F64) -> tuple[F64, F64, F64, F64]:
+        """As ``_trace``: by a state, at times (n,)."""
+        begins = (self.time_s, self.T_world_body, self.velocity, self.turn_rate, self.acceleration)
+        nominal = (self.end.T_world_body, self.end.velocity, self.end.gravity)
+        present = (state.T_world_body, state.velocity, state.gravity)
+        out: tuple[F64, F64, F64, F64] = _trace(begins, nominal, present, time_s)
+        return out
 
-    def _body(self, state: State, time_s: float) -> tuple[F64, F64, F64, F64]:
-        """T_world_body, velocity (world), turn rate (body), and R' (place - what follows without the turn)."""
-        T, velocity, rate = self._nominal(time_s)
-        dt, end, R0 = -time_s, self.end, T[:3, :3]
-        dv = R0.T @ (end.velocity - velocity - end.gravity * dt)
-        dp = R0.T @ (end.T_world_body[:3, 3] - T[:3, 3] - velocity * dt - 0.5 * end.gravity * dt * dt)
-        arm = dv * dt - dp
-        out = np.eye(4)
-        R = state.T_world_body[:3, :3] @ end.T_world_body[:3, :3].T @ R0
-        out[:3, :3] = R
-        out[:3, 3] = state.T_world_body[:3, 3] - state.velocity * dt + 0.5 * state.gravity * dt * dt + R @ arm
-        return out, state.velocity - state.gravity * dt - R @ dv, rate, arm
+
+@njit
+def _trace(
+    begins: tuple[F64, F64, F64, F64, F64],
+    nominal: tuple[F64, F64, F64],
+    present: tuple[F64, F64, F64],
+    time_s: F64,
+) -> tuple[F64, F64, F64, F64]:
+    """T_world_body (n, 4, 4), velocity (world), turn rate (body) and ``dv dt - dp`` (n, 3) at times (n,).
+
+    The path's nominal values give dR, dv and dp, which hold for the present state (pose, velocity, gravity) too.
+    The first and the last piece go on beyond the ends.
+    """
+    starts, poses, velocities, rates, accelerations = begins
+    T_end, v_end, g_end = nominal
+    T_now, v_now, g_now = present
+    R_now_end = np.ascontiguousarray(T_now[:3, :3]) @ np.ascontiguousarray(T_end[:3, :3]).T
+    n, turn = len(time_s), np.zeros(6)
+    T, velocity, rate, arms = np.empty((n, 4, 4)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    for i in range(n):
+        k = max(np.searchsorted(starts, time_s[i], "right") - 1, 0)
+        t, dt = time_s[i] - starts[k], -time_s[i]
+        turn[3:] = t * rates[k]
+        T[i] = poses[k] @ se3.exp(turn)
+        R = np.ascontiguousarray(T[i, :3, :3])
+        place = poses[k, :3, 3] + t * velocities[k] + 0.5 * t * t * accelerations[k]
+        v = velocities[k] + t * accelerations[k]
+        dv = R.T @ (v_end - v - g_end * dt)
+        arm = dv * dt - R.T @ (T_end[:3, 3] - place - v * dt - 0.5 * g_end * dt * dt)
+        R = R_now_end @ R
+        T[i, :3, :3] = R
+        T[i, :3, 3] = T_now[:3, 3] - v_now * dt + 0.5 * g_now * dt * dt + R @ arm
+        velocity[i], rate[i], arms[i] = v_now - g_now * dt - R @ dv, rates[k], arm
+    return T, velocity, rate, arms

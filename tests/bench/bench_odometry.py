@@ -1,6 +1,6 @@
 """CPU time and drift of the odometry on a recording.
 
-    python tests/bench/bench_odometry.py INPUT [--poses FILE.tum] [--frames N] [--no-imu] [--set field=value]
+    python tests/bench/bench_odometry.py INPUT [--poses FILE.tum] [--no-imu] [--every N] [--set field=value]
 
 Prints CPU ms a frame (all threads, file reading excluded, the first two frames apart because kernels compile
 there), frames lost, and with poses (given, or of the input) the errors of ``evaluate trajectory``.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,16 +19,16 @@ import numpy as np
 from artemis_edge.config import load
 from artemis_edge.datasets import open_input
 from artemis_edge.evaluate.trajectory import evaluate_trajectory, to_text
-from artemis_edge.frames import FrameSource, ImuSamples, Trajectory
-from artemis_edge.odometry.lidar_odometry import LidarOdometry
+from artemis_edge.frames import FrameSource, ImuSamples, SyncedFrame, Trajectory
+from artemis_edge.odometry.choice import OwnOdometry, odometry_for
 from artemis_edge.trajectory import read_tum
 
+Frames = Callable[[], Iterator[SyncedFrame]]
 
-def measure(source: FrameSource, odometry: LidarOdometry, frames: int | None, imu: bool) -> Trajectory:
+
+def measure(source: FrameSource, odometry: OwnOdometry, frames: Frames) -> Trajectory:
     stamps, poses, cpu_ms, degenerate = [], [], [], 0
-    for frame in source.frames(0, frames):
-        if not imu:
-            frame = replace(frame, imu=ImuSamples.empty())
+    for frame in frames():
         start = time.process_time()
         tracked = odometry.track(frame)
         cpu_ms.append((time.process_time() - start) * 1e3)
@@ -50,11 +51,19 @@ def main() -> None:
     parser.add_argument("--poses", type=Path)
     parser.add_argument("--frames", type=int)
     parser.add_argument("--no-imu", action="store_true")
+    parser.add_argument("--every", type=int, default=1, help="only every so many frames")
+    parser.add_argument("--first", type=int, default=0, help="and of those the ones from this on")
     parser.add_argument("--set", action="append", default=[], metavar="field=value")
     options = parser.parse_args()
     config = load(sets=[f"odometry.{text}" for text in options.set])
     source = open_input(options.input)
-    estimate = measure(source, LidarOdometry(config.odometry), options.frames, not options.no_imu)
+
+    def frames() -> Iterator[SyncedFrame]:
+        for k, frame in enumerate(source.frames(0, options.frames)):
+            if k % options.every == options.first:
+                yield replace(frame, imu=ImuSamples.empty()) if options.no_imu else frame
+
+    estimate = measure(source, odometry_for(config.odometry, frames), frames)
     reference = read_tum(options.poses) if options.poses else source.poses
     if reference is not None:
         print(to_text(evaluate_trajectory(estimate, reference)))
