@@ -26,7 +26,7 @@ def _float(text: str, *, ge: float | None = None, gt: float | None = None, le: f
 
 
 class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """LiDAR odometry, used when no poses are given (section III-A of the paper, odometry/)."""
+    """Odometry, used when no poses are given (section III-A of the paper, odometry/)."""
 
     voxel_m: Annotated[float, _float("Edge of the finest voxel that holds a plane, m.", ge=0.05, le=5.0)] = (
         0.5
@@ -77,7 +77,8 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
         _float("How fast the sensor may already turn when the recording starts, rad/s.", ge=0.001, le=100.0),
     ] = 0.5
     gyro_sigma: Annotated[
-        float, _float("Error of the gyroscope's rate, bias included, rad/s.", ge=1e-5, le=10.0)
+        float,
+        _float("Error of a slow gyroscope, bias included, where no filter runs, rad/s.", ge=1e-5, le=10.0),
     ] = 0.02
     gyro_noise: Annotated[
         float, _float("White noise of the gyroscope in the filter, rad/s/sqrt(Hz).", ge=1e-6, le=1.0)
