@@ -8,7 +8,7 @@ LEARNT ?= train-out
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint bench soak viewer-test train install-service clean
+.PHONY: help setup demo test lint bench soak ablation viewer-test train install-service clean
 
 help:
 	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
@@ -19,6 +19,7 @@ help:
 	@echo "make viewer-test  GLB and browser view in headless Chromium (fetches three.js with npm)"
 	@echo "make train   render views of the virtual worlds, train and export the shipped network (an hour or two, torch)"
 	@echo "make install-service   as root: the systemd service and what belongs to it (docs/operator.md)"
+	@echo "make ablation  the paper's ablations (Tables III and IV) on a virtual world"
 	@echo "make setup   only create $(VENV); every target does it when needed"
 	@echo "make clean   remove $(VENV) and everything that was generated"
 
@@ -82,7 +83,9 @@ install-service: $(READY)
 	@test -n "$(ROOT)" || { systemctl daemon-reload; sysctl -q --system; udevadm control --reload; }
 	@echo "edit /etc/artemis/rig.toml, name the LiDAR's port in /etc/systemd/network/20-artemis-lidar.network, then:"
 	@echo "  systemctl enable --now artemis-can0 artemis-edge"
+ablation: $(READY)
+	@$(BIN)/python -m artemis_edge.session.ablation --out ablation-out
 
 clean:
-	@rm -rf $(VENV) $(OUT) $(LEARNT) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) $(OUT) $(LEARNT) ablation-out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

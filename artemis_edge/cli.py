@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from artemis_edge.commands import models, output, replay, rig, run, session, texture, tui, view
+from artemis_edge.commands import models, output, replay, rig, run, semantics, session, texture, tui, view
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -99,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
         output.add_render,
         output.add_export,
         view.add,
+        semantics.add_ask,
         _check,
         session.add,
         replay.add,
@@ -191,6 +192,16 @@ def _reprocess(commands: Any) -> None:
         "--holdout", type=_at_least_two, default=0, metavar="N",
         help="keep every N-th photograph of each camera out of the map and write it to PHOTOS.json",
     )  # fmt: skip
+    parser.add_argument(
+        "--query",
+        action="append",
+        default=[],
+        metavar="TEXT",
+        help="what to find, for example 'red car'; may be repeated",
+    )
+    parser.add_argument(
+        "--model", default="", metavar="NAME", help="network that looks for it ('models list')"
+    )
     _json_option(parser)
 
 
@@ -205,6 +216,7 @@ def _evaluate(commands: Any) -> None:
     mesh.add_argument("--heatmap", type=Path, metavar="FILE.png", help="precision and recall from above")
     _json_option(mesh)
     texture.add(kinds)
+    semantics.add_evaluate(kinds)
     path = _command(kinds, "trajectory", run_evaluate_trajectory, "a trajectory against a reference")
     path.add_argument("estimate", type=Path, metavar="ESTIMATE.tum")
     path.add_argument("--reference", type=Path, required=True, metavar="REF.tum")
@@ -287,10 +299,22 @@ def run_reprocess(given: argparse.Namespace) -> int:
     from artemis_edge.runtime import Request
 
     start, stop = given.frames
+    moved = ["voxel_map.dynamic_filter=true"] if given.dynamic_filter else []
     outcomes = batch.run_all(
         [
-            Request(path, out, settings, given.poses, given.no_poses, start, stop, given.holdout)
-            for settings in [config.load(profile=given.profile, sets=given.sets)]
+            Request(
+                path,
+                out,
+                settings,
+                given.poses,
+                given.no_poses,
+                start,
+                stop,
+                given.holdout,
+                tuple(given.query),
+                given.model,
+            )
+            for settings in [config.load(profile=given.profile, sets=[*given.sets, *moved])]
             for path, out in batch.places(given.inputs, given.out)
         ],
         plain=given.json,

@@ -44,7 +44,7 @@ def _kind(request: Request, source: FrameSource, span: range) -> str:
     except UserError:
         frame = None
     poses = "own" if request.own_odometry or (request.poses is None and source.poses is None) else "given"
-    text = f"{sys.version} {poses} {_types(frame)}"
+    text = f"{sys.version} {poses} {_types(frame)} {bool(request.queries)}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -67,4 +67,6 @@ def _compile(request: Request) -> None:
     span = runtime.frame_span(source, request)
     odometry = runtime.choose_odometry(source, request, span)
     with tempfile.TemporaryDirectory(prefix="artemis-compile-") as name:
-        runtime.warm_up_here(request.config, odometry, Path(name), source, span, runtime.pipeline)
+        runtime.warm_up_here(
+            request.config, odometry, Path(name), source, span, runtime.warm_pipeline(request)
+        )

@@ -123,6 +123,12 @@ class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
     free_space: Annotated[
         bool, Meta(description="Whether vertices that later scans look through are removed.")
     ] = True
+    dynamic_filter: Annotated[
+        bool,
+        Meta(
+            description="Whether earlier scans are asked, too, and movable things that were looked through are removed."
+        ),
+    ] = False
     free_space_range_m: Annotated[
         float, _float("How far around the sensor vertices are judged by free space [m].", ge=0.1, le=200.0)
     ] = 30.0
@@ -204,6 +210,45 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
         int,
         Meta(description="Islands of fewer triangles are left out of the finished mesh.", ge=1, le=1_000_000),
     ] = 4
+
+
+class SemanticsConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """Classes in the map: fusion, constraint and refinement (eqs 1 to 8, 12, 13; docs/semantics.md)."""
+
+    reach_m: Annotated[float, _float("How far from the camera masks are believed [m].", ge=1.0, le=200.0)] = (
+        40.0
+    )
+    sigma_d_m: Annotated[
+        float, _float("sigma_d of eq. 1: depth uncertainty that costs a factor e [m].", ge=0.01, le=10.0)
+    ] = 0.15
+    confidence_rate: Annotated[
+        float, _float("lambda of eq. 7: how fast observations make a voxel confident.", ge=0.001, le=100.0)
+    ] = 0.5
+    constraint: Annotated[bool, Meta(description="Whether vertices move by eqs 2 to 8.")] = True
+    sim_semantic: Annotated[
+        bool, Meta(description="Whether eq. 5 weakens smoothing between classes; off: sim = 1.")
+    ] = True
+    lambda_sem: Annotated[
+        float,
+        _float("Weight of E_semantic in eq. 2; 0 leaves edges between objects alone.", ge=0.0, le=100.0),
+    ] = 1.0
+    lambda_smooth: Annotated[float, _float("Weight of E_smoothness in eq. 2.", ge=0.0, le=100.0)] = 0.5
+    temperature: Annotated[float, _float("tau of eq. 5.", ge=0.0, le=100.0)] = 4.0
+    sweeps: Annotated[int, Meta(description="Gauss-Seidel sweeps of the constraint.", ge=1, le=20)] = 3
+    refinement: Annotated[
+        bool, Meta(description="Whether vertices refine their classes by eqs 12 and 13.")
+    ] = True
+    sigma_geom: Annotated[
+        float, _float("sigma_geom of eq. 9 for classes: relative depth error.", ge=0.001, le=1.0)
+    ] = 0.03
+    spread_rings: Annotated[
+        int,
+        Meta(
+            description="Edges that a class reaches beyond what images saw, in the finished mesh.",
+            ge=0,
+            le=100,
+        ),
+    ] = 10
 
 
 class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -360,6 +405,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     keep: KeepConfig = KeepConfig()
     view: ViewConfig = ViewConfig()
     segmentation: SegmentationConfig = SegmentationConfig()
+    semantics: SemanticsConfig = SemanticsConfig()
 
 
 def load(file: Path | None = None, profile: str | None = None, sets: Iterable[str] = ()) -> Config:

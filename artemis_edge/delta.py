@@ -11,12 +11,14 @@ from artemis_edge.block_store import (
     ALIVE,
     BX,
     CHANGED,
+    CLASSES,
     COLOUR,
     COUNT,
     INFORMATION,
     IX,
     IY,
     IZ,
+    LOG_CLASS,
     N_BLOCKS,
     NORMAL,
     PATCH_AT,
@@ -169,6 +171,18 @@ def copy_triangles(store: Store, voxels: I32, triangles: I64) -> None:
             j += 1
 
 
+@kernel
+def copy_labels(store: Store, cells: I32, label: U8) -> None:
+    """Most probable class of the vertices in ``cells``; 0 where no image saw them."""
+    for i in range(cells.shape[0]):
+        row = store.attribute[cells[i]]
+        best = 0
+        for c in range(1, CLASSES):
+            if row[LOG_CLASS + c] > row[LOG_CLASS + best]:
+                best = c
+        label[i] = best
+
+
 class Outbox:
     """Hands out the blocks that changed."""
 
@@ -229,5 +243,7 @@ def to_delta(index: int, store: Store, slots: I32, listing: Listing) -> MeshDelt
     copy_vertices(store, listing.cell[:n], delta.position, delta.normal, delta.confidence)
     read_colours(store, listing.cell[:n], delta.colour)
     sureness(delta.confidence)
+    if store.attribute.shape[1] > LOG_CLASS:
+        copy_labels(store, listing.cell[:n], delta.label)
     copy_triangles(store, listing.voxel[: voxel_start[-1]], delta.triangles)
     return delta

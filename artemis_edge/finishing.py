@@ -22,13 +22,28 @@ ROUNDS = 2
 _SHIFT = 32
 
 
-def finish(vertices: F32, normals: F32, faces: I32, longest_m: float, smallest_island: int) -> I32:
-    """Triangles (t, 3) of the finished mesh over the same ``vertices`` and ``normals`` float32 (n, 3)."""
+def finish(
+    vertices: F32, normals: F32, faces: I32, longest_m: float, smallest_island: int, klass: I32 | None = None
+) -> I32:
+    """Triangles (t, 3) of the finished mesh over the same ``vertices`` and ``normals`` float32 (n, 3).
+
+    ``klass`` int32 (n,) are classes that vertices clearly have, -1 where none: nothing is closed between two.
+    """
     for _ in range(ROUNDS):
-        faces = close_loops(vertices, normals, faces, longest_m)
+        faces = _closed(vertices, normals, faces, longest_m, klass)
         faces = faces[free_edges(faces).sum(axis=1) < 2]
-    faces = close_loops(vertices, normals, faces, longest_m)
+    faces = _closed(vertices, normals, faces, longest_m, klass)
     return faces[large_islands(faces, smallest_island)]
+
+
+def _closed(vertices: F32, normals: F32, faces: I32, longest_m: float, klass: I32 | None) -> I32:
+    closed = close_loops(vertices, normals, faces, longest_m)
+    if klass is None:
+        return closed
+    corner = klass[closed[len(faces) :]]
+    most = corner.max(axis=1, initial=-1)
+    one = ((corner == most[:, None]) | (corner < 0)).all(axis=1)
+    return np.concatenate((faces, closed[len(faces) :][one]))
 
 
 def _half_edges(faces: I32) -> I64:

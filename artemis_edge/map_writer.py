@@ -6,21 +6,27 @@ from pathlib import Path
 
 import numpy as np
 
-from artemis_edge.block_store import COLOUR, INFORMATION, NORMAL, POSITION
+from artemis_edge.block_store import CLASSES, COLOUR, INFORMATION, LOG_CLASS, NORMAL, POSITION
 from artemis_edge.config import Config, to_toml
 from artemis_edge.delta import GREY, confidence
 from artemis_edge.export.atomic import replacing, write_bytes
-from artemis_edge.export.mesh import Mesh
+from artemis_edge.export.mesh import Mesh, bare_mesh
 from artemis_edge.export.ply import write_ply
 from artemis_edge.finishing import finish
 from artemis_edge.frames import F32, I32, I64, U8
 from artemis_edge.paging import Pager, page_bytes
+from artemis_edge.semantic_map import SemanticMap, clear_classes, start_blank
 
 LABELS = {0: "background"}
 
 
-def gather_mesh(pager: Pager, longest_m: float, smallest_island: int) -> Mesh:
-    """All patches as one finished mesh (finishing.py) with shared vertices; unused vertices are left out."""
+def gather_mesh(
+    pager: Pager, longest_m: float, smallest_island: int, semantics: SemanticMap | None = None
+) -> Mesh:
+    """All patches as one finished mesh (finishing.py) with shared vertices; unused vertices are left out.
+
+    With ``semantics`` vertices carry their most probable class, and what no image saw that of its surroundings.
+    """
     ids, triangle_ids = [], []
     for page in pager.pages():
         ids.append(page.vertex_ids()[page.alive()])
@@ -30,19 +36,25 @@ def gather_mesh(pager: Pager, longest_m: float, smallest_island: int) -> Mesh:
     faces = _join(vertex_id, order, triangle_ids)
     del triangle_ids
     position, normal, sure, colour = _attributes(pager, len(vertex_id))
-    faces = finish(position, normal, faces, longest_m, smallest_island)
+    lam = None if semantics is None else _classes(pager, len(vertex_id))
+    klass = None if lam is None else clear_classes(lam)
+    faces = finish(position, normal, faces, longest_m, smallest_island, klass)
     used = np.zeros(len(vertex_id), bool)
     used[faces] = True
     renumber = np.cumsum(used, dtype=np.int32) - np.int32(1)
     n = int(used.sum())
+    faces = renumber[faces]
+    labels = np.zeros(n, np.uint8)
+    if semantics is not None and lam is not None:
+        labels = semantics.finished_labels(lam[used], normal[used], faces)
     return Mesh(
         vertices=position[used],
         normals=normal[used],
         colours=colour[used],
-        labels=np.zeros(n, np.uint8),
+        labels=labels,
         confidence=sure[used],
-        faces=renumber[faces],
-        label_names=LABELS,
+        faces=faces,
+        label_names=LABELS if semantics is None else semantics.names,
     )
 
 
@@ -80,11 +92,36 @@ def _colour_into(colour: U8, attribute: F32) -> None:
         colour[seen] = (attribute[seen, COLOUR : COLOUR + 3] + 0.5).clip(0, 255)
 
 
-def write_mesh(path: Path, pager: Pager, longest_m: float, smallest_island: int) -> Mesh:
+def _classes(pager: Pager, n: int) -> F32:
+    """Log-probabilities float32 (n, CLASSES) of all living vertices; where nobody looked, those of the voxel."""
+    out, row = np.empty((n, CLASSES), np.float32), 0
+    for page in pager.pages():
+        alive = np.flatnonzero(page.alive())
+        voxel = np.repeat(np.arange(len(page.n_cells)), page.n_cells)[alive]
+        part = out[row : row + len(alive)]
+        part[:] = page.attribute[alive, LOG_CLASS:]
+        start_blank(part, page.voxel_class[voxel])
+        row += len(alive)
+    return out
+
+
+def write_mesh(
+    path: Path, pager: Pager, longest_m: float, smallest_island: int, semantics: SemanticMap | None = None
+) -> Mesh:
     """Write ``mesh.ply`` and return what was written."""
-    mesh = gather_mesh(pager, longest_m, smallest_island)
+    mesh = gather_mesh(pager, longest_m, smallest_island, semantics)
     write_ply(path, mesh)
     return mesh
+
+
+REMOVED = "removed.ply"
+
+
+def write_removed(folder: Path, places: F32) -> int:
+    """Write where the dynamic filter removed vertices, points float32 (n, 3), into ``folder``; returns bytes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_ply(folder / REMOVED, bare_mesh(places, np.empty((0, 3), np.int32)))
+    return (folder / REMOVED).stat().st_size
 
 
 def save_map(folder: Path, pager: Pager, config: Config) -> int:

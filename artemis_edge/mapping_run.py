@@ -17,7 +17,7 @@ import numpy as np
 from artemis_edge import health
 from artemis_edge.errors import InputError, RunError, UserError
 from artemis_edge.export.ply import Mesh
-from artemis_edge.frames import F64, FrameSource, MeshDelta, SyncedFrame, TrackedFrame, Trajectory
+from artemis_edge.frames import F32, F64, FrameSource, MeshDelta, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.progress import Report, say
 from artemis_edge.session.results import disk_sentence
 from artemis_edge.session.statistics import RunStatistics
@@ -43,6 +43,11 @@ class Mapper(Protocol):
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
         """All stages for one frame."""
+        ...
+
+    @property
+    def probability(self) -> F32:
+        """Of each vertex of the written mesh, that of its class; empty without classes."""
         ...
 
     def finish(self) -> MeshDelta | None:

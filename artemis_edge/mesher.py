@@ -24,6 +24,7 @@ from artemis_edge.block_store import (
     CHANGED,
     COUNT,
     FRESH,
+    LOG_CLASS,
     NORMAL,
     PATCH_AT,
     PATCH_LEN,
@@ -31,12 +32,14 @@ from artemis_edge.block_store import (
     POSITION,
     QUEUE_LEN,
     QUEUED,
+    WEIGHT,
     Store,
 )
-from artemis_edge.cell_code import CODES, gather_cells, neighbour_shift
+from artemis_edge.cell_code import CODES, code_voxel, gather_cells, neighbour_shift
 from artemis_edge.config import MesherConfig
 from artemis_edge.delaunay import delaunay
 from artemis_edge.frames import F64, I32, U8
+from artemis_edge.semantic_constraint import SemanticConstraint, confident_class
 from artemis_edge.voxel_map import AT_ONCE, RefreshRules, RefreshSpace, VoxelMap, refresh_space, refresh_voxel
 
 # Neighbours' vertices one cell around take part. Two cells halve the edges that neighbours disagree about, but cost
@@ -47,6 +50,8 @@ MOST_TRIANGLES = 512
 FLUSHES = 16  # rounds of the flush; the third finds next to nothing
 FLUSH_PART = 4096  # voxels meshed at a time, so that their neighbours fit into memory
 MOST_GROUPS = 2  # a voxel may hold both sides of a thin wall
+MOST_OBJECTS = 4  # that meet in a voxel
+_NO_CLASS = -2
 EAR = 1 << 15  # flag in the first code of a triangle that only fills a gap
 
 
@@ -59,6 +64,7 @@ class Rules(NamedTuple):
     coplanar: float  # cosine between a triangle's normal and those of its vertices that makes up for evidence
     agreement: float  # least such cosine for any triangle
     group_cosine: float  # vertices whose normal is nearer than this to the direction are meshed together
+    confidence_rate: float  # lambda of eq. 7, for telling objects apart; 0: they are not told apart
 
 
 class Workspace(NamedTuple):
@@ -71,6 +77,7 @@ class Workspace(NamedTuple):
     local_code: I32  # (m,)
     own: U8  # (m,)
     used: U8  # (m,)
+    klass: I32  # (m,) class that the vertex certainly has, -1 where none
     position: F64  # (m, 3) relative to the voxel's corner
     normal: F64  # (m, 3)
     evidence: F64  # (m,)
@@ -89,7 +96,7 @@ class Workspace(NamedTuple):
     triangles: I32  # (MOST_TRIANGLES, 3) local indices
     patch: NDArray[np.uint16]  # (MOST_TRIANGLES, 3) codes
     frame: F64  # (3, 3) rows: first axis, second axis, direction
-    direction: F64  # (MOST_GROUPS, 3)
+    direction: F64  # (MOST_OBJECTS * MOST_GROUPS, 3)
     out: F64  # (3,)
 
 
@@ -104,6 +111,7 @@ def workspace() -> Workspace:
         local_code=np.empty(m, np.int32),
         own=np.empty(m, np.uint8),
         used=np.empty(m, np.uint8),
+        klass=np.empty(m, np.int32),
         position=np.empty((m, 3)),
         normal=np.empty((m, 3)),
         evidence=np.empty(m),
@@ -122,7 +130,7 @@ def workspace() -> Workspace:
         triangles=np.empty((MOST_TRIANGLES, 3), np.int32),
         patch=np.empty((MOST_TRIANGLES, 3), np.uint16),
         frame=np.empty((3, 3)),
-        direction=np.empty((MOST_GROUPS, 3)),
+        direction=np.empty((MOST_OBJECTS * MOST_GROUPS, 3)),
         out=np.empty(3),
     )
 
@@ -133,15 +141,22 @@ def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace)
     bs.neighbours27(store, v, w.neighbour)
     cells = gather_cells(store, w.neighbour, MARGIN_CELLS, w.grid, w.code)
     n = collect_vertices(store, v, cells, voxel_m, w)
+    _tell_apart(store, n, rules.confidence_rate, w)
     triangles = plain = 0
     if n >= 3 and w.own[0]:  # own cells come first; without own vertices nothing is owned
         edges, ears = take_neighbour_edges(store, w)
         groups = 0
-        while groups < MOST_GROUPS and _direction(n, w):
-            triangles, edges = _mesh_group(n, rules, w, triangles, edges)
-            for k in range(3):
-                w.direction[groups, k] = w.frame[2, k]
-            groups += 1
+        klass = _next_class(n, w)
+        while klass != _NO_CLASS and groups < MOST_OBJECTS * MOST_GROUPS:
+            sides = 0
+            while sides < MOST_GROUPS and _direction(n, klass, w):
+                triangles, edges = _mesh_group(n, klass, rules, w, triangles, edges)
+                for k in range(3):
+                    w.direction[groups + sides, k] = w.frame[2, k]
+                sides += 1
+            groups += sides
+            _give_up(n, klass, w)
+            klass = _next_class(n, w)
         plain = triangles
         edges = _settle_ears(store, ears, w, edges)
         for g in range(groups):
@@ -188,6 +203,43 @@ def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Worksp
         w.grid[code] = n
         n += 1
     return n
+
+
+@kernel
+def _tell_apart(store: Store, n: int, rate: float, w: Workspace) -> None:
+    """Which object each local vertex certainly belongs to; with classes off, none."""
+    told = rate > 0.0 and store.attribute.shape[1] > LOG_CLASS
+    for i in range(n):
+        w.klass[i] = -1
+        if told:
+            u = w.neighbour[code_voxel(w.local_code[i])]
+            weight = store.voxel_class[u, WEIGHT]
+            w.klass[i] = confident_class(store.attribute[w.slot[i]], weight, rate)
+
+
+@kernel
+def _next_class(n: int, w: Workspace) -> int:
+    """The lowest certain class among the own vertices not meshed yet; -1 when only uncertain ones are left."""
+    found = _NO_CLASS
+    for i in range(n):
+        if w.own[i] and not w.used[i] and (found == _NO_CLASS or found < 0 or 0 <= w.klass[i] < found):
+            found = w.klass[i]
+    return found
+
+
+@kernel
+def _give_up(n: int, klass: int, w: Workspace) -> None:
+    """Vertices of a class that no group took are left out."""
+    for i in range(n):
+        if w.klass[i] == klass:
+            w.used[i] = 1
+
+
+@kernel
+def is_one_object(a: int, b: int, c: int, w: Workspace) -> bool:
+    """Whether no two corners certainly belong to different objects: E_semantic keeps no such edge."""
+    i, j, k = w.klass[a], w.klass[b], w.klass[c]
+    return (i < 0 or j < 0 or i == j) and (j < 0 or k < 0 or j == k) and (i < 0 or k < 0 or i == k)
 
 
 @kernel
@@ -267,8 +319,9 @@ def _use_edge(w: Workspace, a: int, b: int, edges: int) -> int:
 
 
 @kernel
-def _direction(n: int, w: Workspace) -> bool:
-    """Projection frame for the own vertices not meshed yet: their mean normal, to the nearest of 26 directions.
+def _direction(n: int, klass: int, w: Workspace) -> bool:
+    """Projection frame for the own vertices of an object not meshed yet: their mean normal, to the nearest of 26
+    directions.
 
     Quantised so that neighbours project the same way (measured: a third of the conflicts). False: nothing left.
     """
@@ -276,7 +329,7 @@ def _direction(n: int, w: Workspace) -> bool:
     d[:] = 0.0
     left = 0
     for i in range(n):
-        if w.own[i] and not w.used[i]:
+        if w.own[i] and not w.used[i] and w.klass[i] <= klass and (w.klass[i] < 0 or w.klass[i] == klass):
             left += 1
             for k in range(3):
                 d[k] += w.normal[i, k]
@@ -304,12 +357,12 @@ def _direction(n: int, w: Workspace) -> bool:
 
 
 @kernel
-def _select(n: int, group_cosine: float, w: Workspace) -> int:
-    """Local vertices of the group, projected and sorted along a snake; returns how many."""
+def _select(n: int, klass: int, group_cosine: float, w: Workspace) -> int:
+    """Vertices of the group that may belong to an object, projected and sorted along a snake; how many."""
     u, t, d = w.frame[0], w.frame[1], w.frame[2]
     m = 0
     for i in range(n):
-        if w.used[i]:
+        if w.used[i] or (w.klass[i] >= 0 and w.klass[i] != klass):
             continue
         g = w.normal[i]
         if g[0] * d[0] + g[1] * d[1] + g[2] * d[2] < group_cosine:
@@ -335,9 +388,11 @@ def _select(n: int, group_cosine: float, w: Workspace) -> int:
 
 
 @kernel
-def _mesh_group(n: int, rules: Rules, w: Workspace, triangles: int, edges: int) -> tuple[int, int]:
-    """Delaunay of one group; accepted own triangles are appended. Returns (triangles, edges)."""
-    m = _select(n, rules.group_cosine, w)
+def _mesh_group(
+    n: int, klass: int, rules: Rules, w: Workspace, triangles: int, edges: int
+) -> tuple[int, int]:
+    """Delaunay of one group of one object; accepted own triangles are appended. Returns (triangles, edges)."""
+    m = _select(n, klass, rules.group_cosine, w)
     if m >= 3:
         count = delaunay(w.x, w.y, m, w.corner, w.link, w.stack)
         for t in range(count):
@@ -349,10 +404,30 @@ def _mesh_group(n: int, rules: Rules, w: Workspace, triangles: int, edges: int) 
                 continue
             if w.edge[a, b] or w.edge[b, c] or w.edge[c, a]:
                 continue
+            if klass >= 0 and _holds_another(a, b, c, n, klass, rules.short_edge_m, w):
+                continue
             triangles, edges = _accept(a, b, c, w, triangles, edges)
     for i in range(m):
         w.used[w.order[i]] = 1
     return triangles, edges
+
+
+@kernel
+def _holds_another(a: int, b: int, c: int, n: int, klass: int, near_m: float, w: Workspace) -> bool:
+    """Whether a vertex of another object lies on the triangle: within a quarter of ``near_m`` of its plane, inside
+    its outline as seen along the group's direction. There the surface is the other object's."""
+    d, p = w.frame[2], w.position
+    for i in range(n):
+        if w.klass[i] < 0 or w.klass[i] == klass:
+            continue
+        if _turn(a, b, i, d, p) <= 0.0 or _turn(b, c, i, d, p) <= 0.0 or _turn(c, a, i, d, p) <= 0.0:
+            continue
+        height = 0.0
+        for k in range(3):
+            height += (p[i, k] - (p[a, k] + p[b, k] + p[c, k]) / 3.0) * d[k]
+        if abs(height) < 0.25 * near_m:
+            return True
+    return False
 
 
 @kernel
@@ -439,7 +514,7 @@ def _fill_ears(n: int, d: F64, rules: Rules, w: Workspace, triangles: int, edges
             j = w.hole[j, 2]
             if x == b or w.edge[a, x] or w.edge[x, b] or not (w.own[a] or w.own[b] or w.own[x]):
                 continue
-            if not _faces_out(b, a, x, w) or triangles == MOST_TRIANGLES:
+            if not _faces_out(b, a, x, w) or triangles == MOST_TRIANGLES or not is_one_object(b, a, x, w):
                 continue
             if _edge2(w.position, b, x) > rules.long_edge_m * rules.long_edge_m:
                 continue
@@ -599,9 +674,16 @@ class Mesher:
     """Keeps the patches of a ``VoxelMap`` up to date, a bounded number a frame."""
 
     def __init__(
-        self, config: MesherConfig, voxel_map: VoxelMap, make_ready: Callable[[I32, int], None] | None = None
+        self,
+        config: MesherConfig,
+        voxel_map: VoxelMap,
+        make_ready: Callable[[I32, int], None] | None = None,
+        constraint: SemanticConstraint | None = None,
     ) -> None:
-        """``make_ready`` (blocks, stamp) is called before patches change: their neighbours must be in memory."""
+        """``make_ready`` (blocks, stamp) is called before patches change: their neighbours must be in memory.
+
+        ``constraint`` settles the vertices of what was meshed and tells objects apart.
+        """
         self._map = voxel_map
         self._make_ready = make_ready or (lambda blocks, stamp: None)
         cell = voxel_map.cell_m
@@ -619,12 +701,14 @@ class Mesher:
             coplanar=config.coplanar,
             agreement=config.agreement,
             group_cosine=config.group_cosine,
+            confidence_rate=constraint.telling_apart if constraint is not None else 0.0,
         )
         self._schedule = Schedule(
             config.wait_frames, config.longest_wait_frames, config.fresh, config.growth, config.most_voxels
         )
         self._workspace = workspace()
         self._batch = np.empty(config.most_voxels, np.int32)
+        self._constraint = constraint
         self.refused = 0
 
     def update(self, active: I32, stamp: int) -> None:
@@ -635,6 +719,7 @@ class Mesher:
         self._make_ready(self._blocks(batch), stamp)
         self._refresh(batch, stamp)
         self._mesh(batch, stamp)
+        self._settle(batch, stamp)
 
     def flush(self, stamp: int) -> None:
         """Mesh everything that was postponed. Meshing can promote neighbours, hence until nothing is left.
@@ -647,7 +732,7 @@ class Mesher:
             if len(batch) == 0:
                 return
             parts = [batch[first : first + FLUSH_PART] for first in range(0, len(batch), FLUSH_PART)]
-            for stage in (self._refresh, self._mesh):
+            for stage in (self._refresh, self._mesh, self._settle):
                 for part in parts:
                     self._make_ready(self._blocks(part), stamp)
                     stage(part, stamp)
@@ -666,6 +751,11 @@ class Mesher:
 
     def _refresh(self, batch: I32, stamp: int) -> None:
         refresh_batch(self._map.store, batch, stamp, self._refresh_rules, self._refresh_space)
+
+    def _settle(self, batch: I32, stamp: int) -> None:
+        """Semantic constraint (eqs 2-8) on what was just placed and meshed."""
+        if self._constraint is not None:
+            self._constraint.settle(batch, stamp)
 
     def _mesh(self, batch: I32, stamp: int) -> None:
         voxel_m = self._map.config.voxel_m

@@ -7,39 +7,47 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from artemis_edge.block_store import CHANGED, REFUSED_POINTS
+import numpy as np
+
+from artemis_edge.block_store import CHANGED, CLASSES, LOG_CLASS, REFUSED_POINTS
 from artemis_edge.config import Config
 from artemis_edge.delta import Outbox
 from artemis_edge.export.atlas import write_atlas
 from artemis_edge.export.mesh import Mesh
-from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
-from artemis_edge.map_writer import save_map, write_mesh
+from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
+from artemis_edge.map_writer import save_map, write_mesh, write_removed
 from artemis_edge.mesher import Mesher
 from artemis_edge.paging import TIGHT, Pager
 from artemis_edge.refinement.stage import Refinement
+from artemis_edge.semantic_constraint import SemanticConstraint
+from artemis_edge.semantic_map import Segmenter, SemanticMap
 from artemis_edge.visibility import FreeSpace
 from artemis_edge.voxel_map import VoxelMap
 
 # Python, numba and the libraries before the first frame, and what writing the results takes (docs/tuning.md) [MB]
 BASE_MB = 450
+#: Classes that move by themselves, as far as the dynamic filter is concerned
+MOVABLE = ("person", "cyclist", "bicycle", "motorcycle", "car", "truck", "bus", "van", "dog", "cat")
 
 
 class Pipeline:
     """Frames in, mesh deltas out. Knows nothing of files it was fed from, terminals or sockets."""
 
-    def __init__(self, config: Config, odometry: Odometry, page_folder: Path) -> None:
+    def __init__(
+        self, config: Config, odometry: Odometry, page_folder: Path, segmenter: Segmenter | None = None
+    ) -> None:
+        """Without a ``segmenter`` the map has no classes, and no memory for them."""
         self.config = config
         self.odometry = odometry
-        self.voxel_map = VoxelMap(config.voxel_map, (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6)
+        self.segmenter = segmenter
+        budget = (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6
+        self.voxel_map = VoxelMap(config.voxel_map, budget, LOG_CLASS + (CLASSES if segmenter else 0))
+        self.semantics = self._semantics() if segmenter else None
         self.free_space = FreeSpace(config.voxel_map, self.voxel_map)
-        self.refinement = Refinement(
-            config.refinement,
-            self.voxel_map,
-            (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6,
-            page_folder,
-        )
+        self.refinement = Refinement(config.refinement, self.voxel_map, budget, page_folder)
         self.pager = Pager(self.voxel_map.store, page_folder, self.refinement.pages)
-        self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.prepare)
+        self.constraint = self._constraint()
+        self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.prepare, self.constraint)
         self.outbox = Outbox(self.voxel_map.store)
         self.tracked: TrackedFrame | None = None
         self.trajectory: list[tuple[int, F64]] = []
@@ -58,10 +66,12 @@ class Pipeline:
             self.pager.bring_back(self.voxel_map.touched_blocks(), self._stamp)
         with self._stage("free_space"):
             self.free_space.carve(tracked, self._stamp)
+        self._fuse_masks()
         with self._stage("mesher"):
             self.mesher.update(active, self._stamp)
         with self._stage("refinement"):
             self.refinement.update(tracked, self._stamp)
+        self._offer_images(tracked)
         with self._stage("delta"):
             # what goes to disk must have been told
             tight = self.pager.fill() >= TIGHT
@@ -77,12 +87,55 @@ class Pipeline:
     def finish(self) -> MeshDelta:
         """Everything postponed; the delta holds all that was not told yet."""
         self.stage_ms = {}
+        self._fuse_masks(last=True)
+        if self.semantics is not None and self.config.voxel_map.dynamic_filter:
+            with self._stage("free_space"):
+                self.free_space.remove_movable(self.semantics.slots_of(MOVABLE), self._stamp)
         with self._stage("mesher"):
+            if self.constraint is not None:
+                self.constraint.unsettle(self._stamp)
             self.mesher.flush(self._stamp)
         with self._stage("refinement"):
             self.refinement.finish()
         with self._stage("delta"):
             return self.outbox.everything(self._stamp)
+
+    def _semantics(self) -> SemanticMap:
+        assert self.segmenter is not None
+        semantics = SemanticMap(self.config.semantics, self.voxel_map.store, self.config.voxel_map.voxel_m)
+        semantics.ask(self.segmenter.names)
+        return semantics
+
+    def _constraint(self) -> SemanticConstraint | None:
+        if self.semantics is None or not self.config.semantics.constraint:
+            return None
+        sigma_m = self.config.voxel_map.plane_sigma_m
+        return SemanticConstraint(
+            self.config.semantics,
+            self.voxel_map.store,
+            self.voxel_map.cell_m,
+            sigma_m,
+            self.semantics.active,
+        )
+
+    def _fuse_masks(self, last: bool = False) -> None:
+        """Masks that are done: into the voxels (eq. 1) and, weighed by W, into the vertices (eqs 12, 13)."""
+        if self.segmenter is None or self.semantics is None:
+            return
+        for mask in self.segmenter.drain() if last else self.segmenter.ready():
+            with self._stage("voxel_fusion"):
+                seen = self.semantics.fuse(mask, self._stamp)
+            if self.config.semantics.refinement:
+                with self._stage("semantic_refinement"):
+                    self.semantics.refine(mask, seen, self._stamp)
+
+    def _offer_images(self, tracked: TrackedFrame) -> None:
+        """Images of the frame to the segmentation, with the depth that the map has at their time."""
+        if self.segmenter is None or self.semantics is None:
+            return
+        with self._stage("segmentation"):
+            for image, T_world_lidar in zip(tracked.images, tracked.image_poses, strict=True):
+                self.segmenter.offer(image, self.semantics.sight(image, T_world_lidar))
 
     @property
     def lost(self) -> dict[str, int]:
@@ -94,16 +147,23 @@ class Pipeline:
         }
         return {**{reason: n for reason, n in counts.items() if n}, **self.refinement.lost}
 
+    @property
+    def probability(self) -> F32:
+        """Of each vertex of the written mesh, that of its class; empty without classes."""
+        return np.empty(0, np.float32) if self.semantics is None else self.semantics.probability
+
     def write_mesh(self, path: Path) -> Mesh:
         """Write ``mesh.ply``, finished, and return the mesh."""
         rules = self.config.mesher
         longest_m = rules.long_edge * self.voxel_map.cell_m
-        self._mesh = write_mesh(path, self.pager, longest_m, rules.smallest_island)
+        self._mesh = write_mesh(path, self.pager, longest_m, rules.smallest_island, self.semantics)
         return self._mesh
 
     def save(self, folder: Path) -> int:
         """Write what reopens the map; returns its size in bytes."""
         size = save_map(folder, self.pager, self.config)
+        if self.config.voxel_map.dynamic_filter:
+            size += write_removed(folder, self.free_space.removed)
         if self._mesh is not None:
             atlas = self.refinement.atlas(self._mesh)
             size += write_atlas(folder, atlas) if atlas.pages else 0

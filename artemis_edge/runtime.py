@@ -18,13 +18,18 @@ from artemis_edge.datasets import lidar_poses, open_input
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.export.atlas import read_atlas
 from artemis_edge.export.glb import write_glb
+from artemis_edge.export.objects import objects_json, queries_json
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import FrameSource, Odometry, SyncedFrame, Trajectory
+from artemis_edge.highlight import Reply
 from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, readable, warm_up
 from artemis_edge.odometry.choice import OwnOdometry, odometry_for
 from artemis_edge.odometry.given_poses import GivenPoses
 from artemis_edge.progress import Report, silent
+from artemis_edge.questions import BlankMasks, Questions, ScheduledMasks, unanswered
+from artemis_edge.segmentation.worker import every
+from artemis_edge.semantic_map import Segmenter
 from artemis_edge.session.photos import INDEX, HeldOut
 from artemis_edge.session.report import Evaluation, RunStatistics, write_report
 from artemis_edge.session.results import Results, prepare, scratch
@@ -44,7 +49,8 @@ class Request:
     """What to map and how. ``poses`` a TUM file, ``own_odometry`` ignores poses of the input (--no-poses).
 
     ``start`` and ``stop`` bound the frames (None: the end); ``holdout`` keeps every N-th photograph of each
-    camera out of the map (0: none).
+    camera out of the map (0: none). ``queries`` are questions that the map is to answer, with the ``model`` of the
+    registry (empty: that of the configuration).
     """
 
     input: Path
@@ -55,6 +61,8 @@ class Request:
     start: int = 0
     stop: int | None = None
     holdout: int = 0
+    queries: tuple[str, ...] = ()
+    model: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +76,20 @@ class Outcome:
     warnings: list[str]
 
 
-def pipeline(config: Config, odometry: Odometry, page_folder: Path) -> Mapper:
+def pipeline(
+    config: Config, odometry: Odometry, page_folder: Path, segmenter: Segmenter | None = None
+) -> Mapper:
     """The pipeline of the paper."""
     from artemis_edge.pipeline import Pipeline
 
-    return Pipeline(config, odometry, page_folder)
+    return Pipeline(config, odometry, page_folder, segmenter)
+
+
+def warm_pipeline(request: Request) -> MakeMapper:
+    """The pipeline with masks without content where the request has questions: to compile and load its kernels."""
+    if not request.queries:
+        return pipeline
+    return lambda config, odometry, folder: pipeline(config, odometry, folder, BlankMasks(("anything",)))
 
 
 def reprocess(
@@ -92,26 +109,83 @@ def reprocess(
     odometry = choose_odometry(source, request, span)
     prepare(request.out)
     statistics = RunStatistics(source.name, source.input_hz, config_toml=to_toml(request.config))
-    with scratch(request.out) as pages:
+    with scratch(request.out) as pages, Answering(request) as answering:
         with Interrupt() as interrupt, telling(request.config.view) as live:
             warm_up_run(request, odometry, pages, source, span, statistics, make)
             tracker = odometry()
             photos = HeldOut(request.out, request.holdout)
-            mapper = make(request.config, photos.watching(tracker), pages)
+            mapper = answering.mapper(make, photos.watching(tracker), pages)
             run = MappingRun(mapper, source, span, statistics, live.watching(mapper))
             keeper = Keeper(pages, request.config.keep, request.config.segmentation)
-            run.frames(report, interrupt, keeper.between(photos.take, mapper))
+            run.frames(report, interrupt, answering.between(keeper.between(photos.take, mapper)))
             if not statistics.frame_ms:
                 raise _nothing_mapped(run, source, span)
             run.flush()
         count_losses(statistics, source, tracker, mapper)
         results = Results(request.out)
-        outcome = write_results(results, run.trajectory(), mapper, keeper, photos, statistics, evaluate)
+        outcome = write_results(
+            results, run.trajectory(), mapper, keeper, photos, statistics, evaluate, answering
+        )
     _complain(run, results, request.out)
     if outcome is not None and not outcome["triangles"]:
         raise _nothing_meshed(outcome, request, results)
-    warnings = [*source.warnings, *_skipped(run, statistics)]
+    warnings = [*source.warnings, *_skipped(run, statistics), *answering.warnings]
     return Outcome(request.out, outcome or {}, statistics, run.trajectory(), warnings)
+
+
+class Answering:
+    """The questions of a request, while its run lasts: what asks the network, and what the map answers."""
+
+    def __init__(self, request: Request) -> None:
+        self.warnings: list[str] = []
+        self._request = request
+        model = request.model or request.config.segmentation.model
+        self.questions = Questions.of(request.queries, model) if request.queries else None
+        self._masks: ScheduledMasks | None = None
+
+    def __enter__(self) -> Answering:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._masks is not None:
+            self._masks.close()
+
+    def mapper(self, make: MakeMapper, odometry: Odometry, pages: Path) -> Mapper:
+        """The mapper of the run, with the network at work where a question needs it."""
+        config = self._request.config
+        if self.questions is None or not self.questions.names or make is not pipeline:
+            return make(config, odometry, pages)
+        rule = config.segmentation
+        self._masks = self.questions.segmenter(every(rule.every, rule.delay_frames))
+        return pipeline(config, odometry, pages, self._masks)
+
+    def between(self, prepare: Callable[[SyncedFrame], SyncedFrame]) -> Callable[[SyncedFrame], SyncedFrame]:
+        """``prepare``, which is called before every frame, after the masks that the frame will need are there."""
+        masks = self._masks
+        if masks is None:
+            return prepare
+
+        def both(frame: SyncedFrame) -> SyncedFrame:
+            masks.settle()
+            return prepare(frame)
+
+        return both
+
+    def replies(self, mesh: Mesh, mapper: Mapper) -> list[Reply]:
+        """What the map answers to each question."""
+        if self.questions is None:
+            return []
+        if self._masks is None:
+            return unanswered(self.questions, "nothing in it can be looked for")
+        tally = self._masks.work.tally
+        if tally.first_fault:
+            self.warnings.append(
+                f"{tally.faulty} photographs could not be segmented; the first: {tally.first_fault}"
+            )
+        if tally.segmented == 0:
+            self.warnings.append("no photograph was segmented: the input has none that the frames could use")
+            return unanswered(self.questions, "the recording has no photographs to look at")
+        return self.questions.replies(mesh, mapper.probability)
 
 
 def frame_span(source: FrameSource, request: Request) -> range:
@@ -157,6 +231,7 @@ def warm_up_run(
     start = time.perf_counter()
     if make is pipeline:
         compile_ahead(request, source, span)
+        make = warm_pipeline(request)
     warm_up_here(request.config, odometry, pages, source, span, make)
     statistics.warmup_s = time.perf_counter() - start
     gc.collect()
@@ -197,6 +272,7 @@ def write_results(
     photos: HeldOut,
     statistics: RunStatistics,
     evaluate: Evaluate | None,
+    answering: Answering | None = None,
 ) -> dict[str, Any] | None:
     """All results, small ones first; returns the report."""
     results.attempt("trajectory.tum", lambda path: _write_tum(path, trajectory))
@@ -212,13 +288,18 @@ def write_results(
     if mesh is None:
         return None
     whole = mesh
+    replies = answering.replies(whole, mapper) if answering is not None else []
+    if replies:
+        results.json("objects.json", objects_json(replies))
     atlas = read_atlas(results.folder / "map") if saved else None
     results.attempt("mesh.glb", lambda path: write_glb(path, whole, atlas))
     statistics.peak_rss_mb = health.peak_resident_mb() or None
     evaluation = evaluate(whole, trajectory) if evaluate is not None and len(whole.faces) else None
     return results.attempt(
         "report.html",
-        lambda path: write_report(path.parent, whole, trajectory, statistics, (), evaluation),
+        lambda path: write_report(
+            path.parent, whole, trajectory, statistics, queries_json(replies), evaluation
+        ),
     )
 
 

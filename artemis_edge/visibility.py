@@ -8,6 +8,7 @@ that drove on, a mixed point between two surfaces.
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -25,16 +26,22 @@ from artemis_edge.block_store import (
     IX,
     IY,
     IZ,
+    POSITION,
     SUM,
     THROUGH,
     Store,
 )
+from artemis_edge.class_rows import clear_class
 from artemis_edge.config import VoxelMapConfig
-from artemis_edge.frames import F32, F64, I32, DeskewedScan, TrackedFrame
+from artemis_edge.frames import F32, F64, I32, I64, U8, DeskewedScan, TrackedFrame
 from artemis_edge.range_cube import FAR, PIXELS, SPREAD, TILE, RangeCube, Rays, look_up, new_rays, pixel
 from artemis_edge.voxel_map import AT_ONCE, VoxelMap, is_seen_through
 
 EVERY = 2  # frames between two judgements; each takes every second block
+# With the dynamic filter: earlier scans that look at what is there now, this many frames apart
+LOOKS_BACK, APART = 5, 6
+MOVED = 0.1  # share of the looks at a movable thing that must have gone through it
+MOST_REMOVED = 1 << 20  # places of removed vertices that are remembered
 
 
 class FreeSpace:
@@ -47,7 +54,8 @@ class FreeSpace:
         self._rules = CarveRules(
             voxel_map.block_m, config.free_space_range_m, config.voxel_m, config.free_space_slope
         )
-        self._candidates = new_candidates()
+        self._candidates = new_candidates(MOST_REMOVED if config.dynamic_filter else 1)
+        self._earlier: deque[View] = deque(maxlen=LOOKS_BACK)
 
     def carve(self, frame: TrackedFrame, stamp: int) -> int:
         """Count looks through and confirmations of a frame; returns how many vertices were carved."""
@@ -55,8 +63,45 @@ class FreeSpace:
         if self._config.free_space and stamp % EVERY == 0:
             for scan in frame.scans:
                 self._cube.look(scan)
-                gone += carve(self._map.store, self._view(frame, scan), self._rules, stamp, self._candidates)
+                view = self._view(frame, scan)
+                gone += carve(self._map.store, view, self._rules, stamp, self._candidates)
+                if self._config.dynamic_filter:
+                    gone += self._look_back(view, stamp)
         return gone
+
+    def _look_back(self, view: View, stamp: int) -> int:
+        """What earlier scans looked through was not there then: it came since, so it can move.
+
+        One of them a judgement, in turn, each with every second block as the scan itself.
+        """
+        gone, turn = 0, stamp // EVERY
+        if self._earlier:
+            earlier = self._earlier[(turn // 2) % len(self._earlier)]
+            gone = carve(self._map.store, earlier, self._rules, stamp, self._candidates)
+        if turn % (APART // EVERY) == 0:
+            self._earlier.append(
+                view._replace(range_m=view.range_m.copy(), farthest_m=view.farthest_m.copy())
+            )
+        return int(gone)
+
+    def remove_movable(self, movable: U8, stamp: int) -> int:
+        """Remove what clearly has one of the classes ``movable`` uint8 (CLASSES,) and was looked through at all.
+
+        Of a house a stray look proves nothing; of a person it is enough. Returns how many vertices were removed.
+        """
+        store = self._map.store
+        blocks = np.flatnonzero(store.block[: store.counter[bs.N_BLOCKS], bs.SEEN] >= 0).astype(np.int32)
+        return int(remove_movable(store, blocks, movable, stamp, self._candidates))
+
+    @property
+    def removed(self) -> F32:
+        """Where vertices were removed, float32 (n, 3) world, the first ``MOST_REMOVED``; with the dynamic filter."""
+        count = min(int(self._candidates.number[0]), len(self._candidates.gone))
+        return (
+            self._candidates.gone[:count].copy()
+            if self._config.dynamic_filter
+            else np.empty((0, 3), np.float32)
+        )
 
     def _view(self, frame: TrackedFrame, scan: DeskewedScan) -> View:
         R, t = frame.T_world_lidar[:3, :3], frame.T_world_lidar[:3, 3]
@@ -94,10 +139,12 @@ class Candidates(NamedTuple):
     )
     total: F32  # (3, n) sum over the cell's points from its centre [m]
     rays: Rays  # to the mean
+    gone: F32  # (m, 3) places of the vertices removed so far
+    number: I64  # (1,) how many
 
 
-def new_candidates() -> Candidates:
-    """Fresh scratch memory."""
+def new_candidates(remember: int = 1) -> Candidates:
+    """Fresh scratch memory; the first ``remember`` places of removed vertices are kept."""
     n = 512 * 64
     return Candidates(
         corner_of=np.empty(512, np.int32),
@@ -107,6 +154,8 @@ def new_candidates() -> Candidates:
         place=np.empty((3, n), np.float32),
         total=np.empty((3, n), np.float32),
         rays=new_rays(n),
+        gone=np.empty((remember, 3), np.float32),
+        number=np.zeros(1, np.int64),
     )
 
 
@@ -238,15 +287,67 @@ def _judge(store: Store, n: int, range_m: F32, rules: CarveRules, stamp: int, w:
             continue
         e[THROUGH] += 1.0
         if is_seen_through(e):
+            if store.state[s] == ALIVE:
+                _remember(store.vertex[s], w)
             if store.state[s] == ALIVE and w.voxel[i] != last:
                 last = w.voxel[i]
                 _remesh_around(store, last, stamp)
-            store.state[s] = CARVED
-            e[HITS] = 0.0
-            for k in range(COUNT, THROUGH):
-                e[k] = 0.0
+            _forget(store, s)
             gone += 1
     return gone
+
+
+@kernel
+def remove_movable(store: Store, blocks: I32, movable: U8, stamp: int, w: Candidates) -> int:
+    """Kernel of :meth:`FreeSpace.remove_movable` for resident ``blocks``."""
+    gone = 0
+    for block in blocks:
+        for inner in range(512):
+            v = store.block_voxel[block, inner]
+            if v < 0:
+                continue
+            before = gone
+            mask = store.voxel_mask[v]
+            while mask != 0:
+                s = store.voxel_cell[v, bs.lowest_bit(mask)]
+                mask &= mask - np.uint64(1)
+                if store.state[s] == ALIVE and _has_moved(store.evidence[s], store.attribute[s], movable):
+                    _remember(store.vertex[s], w)
+                    _forget(store, s)
+                    gone += 1
+            if gone > before:
+                _remesh_around(store, v, stamp)
+    return gone
+
+
+@kernel
+def _has_moved(e: F32, attribute: F32, movable: U8) -> bool:
+    klass = clear_class(attribute)
+    return bool(
+        klass >= 0
+        and movable[klass]
+        and e[THROUGH] >= 1.0
+        and e[THROUGH] >= MOVED * (e[THROUGH] + e[CONFIRMED])
+    )
+
+
+@kernel
+def _forget(store: Store, s: int) -> None:
+    """A cell loses its vertex and its evidence, all but what was looked through it."""
+    store.state[s] = CARVED
+    store.evidence[s, HITS] = 0.0
+    for k in range(COUNT, THROUGH):
+        store.evidence[s, k] = 0.0
+
+
+@kernel
+def _remember(vertex: F32, w: Candidates) -> None:
+    """Keep the place of a vertex that is removed."""
+    at = w.number[0]
+    if at < w.gone.shape[0]:
+        for k in range(3):
+            w.gone[at, k] = vertex[POSITION + k]
+    w.number[0] += 1
 
 
 @kernel

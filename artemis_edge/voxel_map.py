@@ -36,6 +36,7 @@ from artemis_edge.block_store import (
     Store,
 )
 from artemis_edge.cell_code import CODES, OWN, code_in, code_of, gather_cells
+from artemis_edge.class_rows import are_two_objects
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.eigen3 import smallest_eigen3
 from artemis_edge.frames import F32, F64, I32, U8, TrackedFrame
@@ -68,11 +69,12 @@ class VoxelMap:
     ``insert`` allocates a frame's points; ``store`` is read and written by the mesher.
     """
 
-    def __init__(self, config: VoxelMapConfig, budget_bytes: float) -> None:
+    def __init__(self, config: VoxelMapConfig, budget_bytes: float, attributes: int = bs.LOG_CLASS) -> None:
+        """``attributes`` columns a vertex carries beside its geometry: 4, or 20 with classes (block_store.py)."""
         self.config = config
         self.cell_m = config.voxel_m / bs.CELLS_PER_VOXEL
         self.block_m = config.voxel_m * bs.VOXELS_PER_BLOCK
-        self.store = bs.allocate(budget_bytes, bs.LOG_CLASS)
+        self.store = bs.allocate(budget_bytes, attributes)
         self._touched = np.empty(self.store.voxel.shape[0], np.int32)
         self._insert_rules = InsertRules(
             self.cell_m, config.min_range_m, config.max_range_m, config.noise_range_m
@@ -395,7 +397,9 @@ def _is_crowded(store: Store, grid: I32, slot: I32, at: int, s: int, distance: f
                 if theirs < mine or (theirs == mine and slot[i] > s):
                     continue
                 q = store.vertex[slot[i]]
-                if (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2 < distance * distance:
+                near = (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2 < distance * distance
+                # where two objects meet, their vertices may
+                if near and not are_two_objects(store.attribute[s], store.attribute[slot[i]]):
                     return True
     return False
 

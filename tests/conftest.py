@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from artemis_edge.export.ply import Mesh, bare_mesh, write_ply
-from artemis_edge.frames import F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
+from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
 
 
 class FakeMapper:
@@ -58,6 +58,10 @@ class FakeMapper:
         write_ply(path, mesh)
         return mesh
 
+    @property
+    def probability(self) -> F32:
+        return np.empty(0, np.float32)
+
     def save(self, folder: Path) -> int:
         return (folder / "blocks.bin").write_bytes(b"blocks")
 
@@ -67,7 +71,7 @@ def fake_pipeline(monkeypatch: pytest.MonkeyPatch) -> list[FakeMapper]:
     """Puts FakeMapper in the place of the pipeline; the list holds those made (the last one maps)."""
     made: list[FakeMapper] = []
 
-    def make(config: object, odometry: Odometry, page_folder: Path) -> FakeMapper:
+    def make(config: object, odometry: Odometry, page_folder: Path, segmenter: object = None) -> FakeMapper:
         assert page_folder.is_dir()
         made.append(FakeMapper(odometry))
         return made[-1]

@@ -1,0 +1,424 @@
+"""Section III-B, eqs 2 to 8: the unified energy, minimised by nonlinear Gauss-Seidel on the active vertices.
+
+    E_total = E_geometry + lambda_sem E_semantic + lambda_smooth E_smoothness                               (2)
+
+Active are the vertices of the voxels that were just meshed: their positions come fresh from the evidence, and what
+is computed here is what stays until their evidence changes. N(v_i) are the living vertices of the cells around
+v_i's own, which are those that the triangulation connects it with. docs/semantics.md says how every point that the
+paper leaves open is resolved.
+
+E_smoothness and E_geometry move a vertex along its normal and turn the normal. E_semantic has its least value where
+no edge joins two objects: the triangulation keeps none (``mesher.py`` triangulates objects apart), and here the
+vertices on both sides slide in their surfaces towards where these meet, by at most half the point spacing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from artemis_edge import block_store as bs
+from artemis_edge._jit import kernel
+from artemis_edge.block_store import (
+    ALIVE,
+    BLOCK,
+    CHANGED,
+    CLASSES,
+    FRESH,
+    LOG_CLASS,
+    NORMAL,
+    POSITION,
+    ROUGHNESS,
+    WEIGHT,
+    Store,
+)
+from artemis_edge.cell_code import CODES, OWN, code_of, code_voxel, gather_cells
+from artemis_edge.class_rows import clear_class
+from artemis_edge.config import SemanticsConfig
+from artemis_edge.frames import F32, F64, I32, U8
+from artemis_edge.paging import resident_blocks
+from artemis_edge.refinement.semantics import probabilities
+from artemis_edge.voxel_map import AT_ONCE
+
+MARGIN = 1  # cells around a voxel in which neighbours are looked for
+MOST = 216  # cells of a voxel and its margin
+# A clear class (class_rows.py) is an object's own, as far as triangles are concerned, when its voxel is so confident
+# (eq. 7)
+CONFIDENT_XI = 0.5
+# Neighbours whose normals differ more do not lie on one surface, whatever their class (cosine)
+ONE_SURFACE = 0.9
+# Cosine between normals above which two surfaces continue each other, so that they meet half-way
+COPLANAR = 0.9
+# Bits of a code in which all own cells agree (cell_code.py)
+_FIRST, _NOT_OWN = code_of(OWN, OWN, OWN), ~code_of(3, 3, 3)
+
+
+class Energy(NamedTuple):
+    """The constants of eqs 2 to 8; lengths in metres."""
+
+    lambda_sem: float
+    lambda_smooth: float
+    tau: float  # eq. 5
+    rate: float  # lambda of eq. 7
+    sim: bool  # eq. 5; False: sim = 1
+    spacing_m: float  # r: unit of the edge lengths L
+    sigma_m: float  # noise of the evidence along the normal: scale of E_geometry
+
+
+class Space(NamedTuple):
+    """Scratch: the living vertices of a voxel and its margin."""
+
+    neighbour: I32  # (27,)
+    grid: I32  # (CODES,) slot, then row; -1 where nothing
+    code: I32  # (1728,)
+    slot: I32  # (m,)
+    where: I32  # (m,) code
+    own: I32  # (m,) row of the anchor, -1 for the margin's
+    P: F32  # (m, CLASSES) P_sem
+    best: I32  # (m,) most probable class
+    entropy: F64  # (m,)
+    xi: F64  # (m,) semantic confidence, eq. 7
+
+
+def new_space() -> Space:
+    """Fresh scratch memory."""
+    return Space(
+        neighbour=np.empty(27, np.int32),
+        grid=np.full(CODES, -1, np.int32),
+        code=np.empty(1728, np.int32),
+        slot=np.empty(MOST, np.int32),
+        where=np.empty(MOST, np.int32),
+        own=np.empty(MOST, np.int32),
+        P=np.empty((MOST, CLASSES), np.float32),
+        best=np.empty(MOST, np.int32),
+        entropy=np.empty(MOST),
+        xi=np.empty(MOST),
+    )
+
+
+class SemanticConstraint:
+    """Minimises the energy over batches of voxels; ``active`` uint8 (CLASSES,) are the slots in use."""
+
+    def __init__(
+        self, config: SemanticsConfig, store: Store, cell_m: float, sigma_m: float, active: U8
+    ) -> None:
+        self._store, self._active, self._sweeps = store, active, config.sweeps
+        self.energy = Energy(
+            config.lambda_sem,
+            config.lambda_smooth,
+            config.temperature,
+            config.confidence_rate,
+            config.sim_semantic,
+            cell_m,
+            sigma_m,
+        )
+        self._space = new_space()
+        self._anchor = np.empty((4096, 8), np.float32)
+
+    @property
+    def telling_apart(self) -> float:
+        """lambda of eq. 7 for the triangulation; 0 where E_semantic has no weight."""
+        return self.energy.rate if self.energy.lambda_sem > 0.0 else 0.0
+
+    def unsettle(self, stamp: int) -> None:
+        """Let all voxels where objects meet be placed and meshed once more: classes have become surer since."""
+        if self.telling_apart > 0.0:
+            blocks = np.empty(len(self._store.block), np.int32)
+            blocks = blocks[: resident_blocks(self._store, blocks)]
+            wake_borders(
+                self._store,
+                np.sort(blocks),
+                self.energy.rate,
+                stamp,
+                np.empty(27, np.int32),
+                np.zeros(len(self._store.voxel), np.int32),
+            )
+
+    def settle(self, batch: I32, stamp: int) -> None:
+        """Move the vertices of the voxels ``batch``, which were just placed by their evidence."""
+        room = int(count_cells(self._store, batch))
+        if room > len(self._anchor):
+            self._anchor = np.empty((2 * room, 8), np.float32)
+        first = np.empty(len(batch), np.int32)
+        keep_anchors(self._store, batch, first, self._anchor)
+        for _ in range(self._sweeps):
+            sweep(self._store, batch, first, self._anchor, self.energy, self._active, self._space)
+        if self.energy.lambda_sem > 0.0:
+            slide(self._store, batch, first, self._anchor, self.energy, self._active, self._space)
+
+
+@kernel
+def count_cells(store: Store, batch: I32) -> int:
+    """Most vertices that the voxels can have."""
+    n = 0
+    for v in batch:
+        mask = store.voxel_mask[v]
+        while mask != 0:
+            mask &= mask - np.uint64(1)
+            n += 1
+    return n
+
+
+@kernel
+def keep_anchors(store: Store, batch: I32, first: I32, anchor: F32) -> None:
+    """Where the evidence puts the vertices: rows from ``first[k]`` on are those of the k-th voxel's cells."""
+    n = 0
+    for k in range(batch.shape[0]):
+        first[k] = n
+        mask = store.voxel_mask[batch[k]]
+        while mask != 0:
+            s = store.voxel_cell[batch[k], bs.lowest_bit(mask)]
+            mask &= mask - np.uint64(1)
+            for q in range(8):
+                anchor[n, q] = store.vertex[s, q]
+            n += 1
+
+
+@kernel
+def gather(store: Store, v: int, first: int, energy: Energy, active: U8, w: Space) -> tuple[int, int]:
+    """Living vertices of a voxel (they come first) and its margin, with their distributions; how many, own, all.
+
+    ``grid[code]`` is then the row of a cell's vertex; :func:`release` empties it again.
+    """
+    bs.neighbours27(store, v, w.neighbour)
+    cells = gather_cells(store, w.neighbour, MARGIN, w.grid, w.code)
+    n = own = row = 0
+    for i in range(cells):
+        code = w.code[i]
+        s = w.grid[code]
+        w.grid[code] = -1
+        is_own = ((code ^ _FIRST) & _NOT_OWN) == 0
+        if store.state[s] == ALIVE:
+            w.slot[n], w.where[n] = s, code
+            w.own[n] = first + row if is_own else -1
+            w.grid[code] = n
+            own += is_own
+            n += 1
+        row += is_own
+    for i in range(n if own > 0 else 0):
+        lam = store.attribute[w.slot[i], LOG_CLASS:]
+        w.best[i] = probabilities(lam, active, w.P[i])
+        w.entropy[i] = entropy(w.P[i])
+        weight = store.voxel_class[w.neighbour[code_voxel(w.where[i])], WEIGHT]
+        w.xi[i] = 1.0 - math.exp(-energy.rate * weight)  # eq. 7
+    return own, n
+
+
+@kernel
+def release(n: int, w: Space) -> None:
+    """Empty the grid."""
+    for i in range(n):
+        w.grid[w.where[i]] = -1
+
+
+@kernel
+def entropy(P: F32) -> float:
+    """-sum P log P."""
+    total = 0.0
+    for c in range(CLASSES):
+        if P[c] > 0.0:
+            total -= P[c] * math.log(P[c])
+    return total
+
+
+@kernel
+def jensen_shannon(P: F32, Q: F32, entropy_P: float, entropy_Q: float) -> float:
+    """JS divergence 0..ln 2 of eq. 3: H((P + Q) / 2) - (H(P) + H(Q)) / 2."""
+    mixed = 0.0
+    for c in range(CLASSES):
+        m = 0.5 * (P[c] + Q[c])
+        if m > 0.0:
+            mixed -= m * math.log(m)
+    return max(mixed - 0.5 * (entropy_P + entropy_Q), 0.0)
+
+
+@kernel
+def similarity(i: int, j: int, energy: Energy, w: Space) -> float:
+    """sim_semantic of eq. 5.
+
+    What is known of a vertex counts by its confidence: between vertices of which nothing is known there is no
+    boundary.
+    """
+    if not energy.sim:
+        return 1.0
+    sure = 0.99
+    if w.best[i] == w.best[j] and w.P[i, w.best[i]] > sure and w.P[j, w.best[j]] > sure:
+        return 1.0
+    js = jensen_shannon(w.P[i], w.P[j], w.entropy[i], w.entropy[j])
+    return math.exp(-energy.tau * math.sqrt(w.xi[i] * w.xi[j] * js))
+
+
+@kernel
+def sweep(store: Store, batch: I32, first: I32, anchor: F32, energy: Energy, active: U8, w: Space) -> None:
+    """One Gauss-Seidel sweep: every vertex takes the least energy given the others as they are now."""
+    for k in range(batch.shape[0]):
+        own, n = gather(store, batch[k], first[k], energy, active, w)
+        for i in range(own):
+            _relax(store, i, anchor[w.own[i]], energy, w)
+        release(n, w)
+
+
+@kernel
+def _relax(store: Store, i: int, start: F32, energy: Energy, w: Space) -> None:
+    """Turn the normal of row ``i`` to the least of E_smoothness, then move it along it to the least of E_total."""
+    p, code = store.vertex[w.slot[i]], w.where[i]
+    nx, ny, nz = np.float64(start[NORMAL]), np.float64(start[NORMAL + 1]), np.float64(start[NORMAL + 2])
+    ax, ay, az = np.float64(start[POSITION]), np.float64(start[POSITION + 1]), np.float64(start[POSITION + 2])
+    # evidence that does not lie on a plane says less about where the surface is and which way it faces
+    sigma2 = energy.sigma_m * energy.sigma_m
+    trust = sigma2 / (sigma2 + start[ROUGHNESS] * start[ROUGHNESS])
+    mx, my, mz = trust * nx, trust * ny, trust * nz
+    top = bottom = 0.0
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                j = w.grid[code + (dx << 10) + (dy << 5) + dz]
+                if j < 0 or j == i:
+                    continue
+                q = store.vertex[w.slot[j]]
+                gx, gy, gz = np.float64(q[NORMAL]), np.float64(q[NORMAL + 1]), np.float64(q[NORMAL + 2])
+                if p[NORMAL] * gx + p[NORMAL + 1] * gy + p[NORMAL + 2] * gz < ONE_SURFACE:
+                    continue
+                ex, ey, ez = ax - q[POSITION], ay - q[POSITION + 1], az - q[POSITION + 2]
+                length = max(math.sqrt(ex * ex + ey * ey + ez * ez), 0.1 * energy.spacing_m)
+                w_geo = energy.spacing_m / length
+                w_smooth = energy.lambda_smooth * similarity(i, j, energy, w) * w_geo  # eq. 8
+                mx, my, mz = mx + w_smooth * gx, my + w_smooth * gy, mz + w_smooth * gz
+                across = nx * gx + ny * gy + nz * gz
+                top += w_smooth * (ex * gx + ey * gy + ez * gz) * across
+                bottom += w_smooth * across * across
+    length = math.sqrt(mx * mx + my * my + mz * mz)
+    if length > 1e-9:
+        p[NORMAL], p[NORMAL + 1], p[NORMAL + 2] = mx / length, my / length, mz / length
+    if bottom == 0.0:
+        return
+    step = -top / (trust + bottom)
+    step = max(min(step, energy.sigma_m), -energy.sigma_m)
+    p[POSITION], p[POSITION + 1], p[POSITION + 2] = ax + step * nx, ay + step * ny, az + step * nz
+
+
+@kernel
+def confident_class(attribute: F32, weight: float, rate: float) -> int:
+    """The class a vertex certainly has, -1 where none: clear of all others (log), its voxel confident (eq. 7)."""
+    if weight <= 0.0 or 1.0 - math.exp(-rate * weight) < CONFIDENT_XI:
+        return -1
+    return int(clear_class(attribute))
+
+
+@kernel
+def wake_borders(store: Store, blocks: I32, rate: float, stamp: int, neighbour: I32, kinds: I32) -> None:
+    """Enqueue the voxels of ``blocks`` that, with their neighbours, hold vertices certain of different classes.
+
+    ``neighbour`` int32 (27,) and ``kinds`` int32 (voxels,) are scratch.
+    """
+    for block in blocks:
+        for inner in range(512):
+            v = store.block_voxel[block, inner]
+            if v >= 0:
+                kinds[v] = classes_in(store, v, rate)
+    for block in blocks:
+        for inner in range(512):
+            v = store.block_voxel[block, inner]
+            if v < 0 or kinds[v] == 0:
+                continue
+            bs.neighbours27(store, v, neighbour)
+            together = 0
+            for u in neighbour:
+                together |= kinds[u] if u >= 0 else 0
+            if together & (together - 1) != 0:
+                store.voxel[v, FRESH] += AT_ONCE
+                bs.enqueue(store, v, stamp)
+
+
+@kernel
+def classes_in(store: Store, v: int, rate: float) -> int:
+    """The certain classes of a voxel's vertices as bits."""
+    bits = 0
+    for c in range(64):
+        s = store.voxel_cell[v, c]
+        if s >= 0 and store.state[s] == ALIVE:
+            k = confident_class(store.attribute[s], store.voxel_class[v, WEIGHT], rate)
+            bits |= 1 << k if k >= 0 else 0
+    return bits
+
+
+@kernel
+def slide(store: Store, batch: I32, first: I32, anchor: F32, energy: Energy, active: U8, w: Space) -> None:
+    """Tangential motion under E_semantic: vertices beside another object go to where the two surfaces meet."""
+    for k in range(batch.shape[0]):
+        v = batch[k]
+        own, n = gather(store, v, first[k], energy, active, w)
+        for i in range(n if own > 0 else 0):
+            weight = store.voxel_class[w.neighbour[code_voxel(w.where[i])], WEIGHT]
+            w.best[i] = confident_class(store.attribute[w.slot[i]], weight, energy.rate)
+        for i in range(own):
+            if w.best[i] >= 0 and _slide_one(store, i, energy, w):
+                store.block[store.voxel[v, BLOCK], CHANGED] = max(
+                    store.block[store.voxel[v, BLOCK], CHANGED], 1
+                )
+        release(n, w)
+
+
+@kernel
+def _slide_one(store: Store, i: int, energy: Energy, w: Space) -> bool:
+    """The mean of the ways to where the surface of row ``i`` meets those of other objects beside it."""
+    p, code = store.vertex[w.slot[i]], w.where[i]
+    nx, ny, nz = np.float64(p[NORMAL]), np.float64(p[NORMAL + 1]), np.float64(p[NORMAL + 2])
+    sx = sy = sz = total = 0.0
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                j = w.grid[code + (dx << 10) + (dy << 5) + dz]
+                if j < 0 or w.best[j] < 0 or w.best[j] == w.best[i]:
+                    continue
+                q = store.vertex[w.slot[j]]
+                ex, ey, ez = (
+                    np.float64(q[POSITION]) - p[POSITION],
+                    np.float64(q[POSITION + 1]) - p[POSITION + 1],
+                    np.float64(q[POSITION + 2]) - p[POSITION + 2],
+                )
+                away = ex * nx + ey * ny + ez * nz
+                tx, ty, tz = ex - away * nx, ey - away * ny, ez - away * nz
+                length = math.sqrt(tx * tx + ty * ty + tz * tz)
+                if length < 1e-6:
+                    continue
+                gx, gy, gz = np.float64(q[NORMAL]), np.float64(q[NORMAL + 1]), np.float64(q[NORMAL + 2])
+                share = _meeting(nx * gx + ny * gy + nz * gz, ex, ey, ez, gx, gy, gz, tx, ty, tz)
+                weight = energy.lambda_sem * w.xi[i] * w.xi[j] * energy.spacing_m / length  # eq. 6
+                sx, sy, sz = sx + weight * share * tx, sy + weight * share * ty, sz + weight * share * tz
+                total += weight
+    if total == 0.0:
+        return False
+    sx, sy, sz = sx / total, sy / total, sz / total
+    length = math.sqrt(sx * sx + sy * sy + sz * sz)
+    if length < 1e-6:
+        return False
+    k = min(1.0, 0.5 * energy.spacing_m / length)
+    p[POSITION] += k * sx
+    p[POSITION + 1] += k * sy
+    p[POSITION + 2] += k * sz
+    return True
+
+
+@kernel
+def _meeting(
+    cosine: float,
+    ex: float,
+    ey: float,
+    ez: float,
+    gx: float,
+    gy: float,
+    gz: float,
+    tx: float,
+    ty: float,
+    tz: float,
+) -> float:
+    """Share 0..1 of the way t in one surface towards the other's vertex (at e, normal g) at which the two meet."""
+    if abs(cosine) > COPLANAR:
+        return 0.5
+    along = tx * gx + ty * gy + tz * gz
+    if abs(along) < 1e-9:
+        return 0.5
+    return min(max((ex * gx + ey * gy + ez * gz) / along, 0.0), 1.0)

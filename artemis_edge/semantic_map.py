@@ -1,0 +1,213 @@
+"""The Semantic Brush on the map: masks in, classes of voxels and vertices out.
+
+Holds which class is in which slot and the scratch memory; the mathematics is in ``voxel_fusion.py`` (eq. 1),
+``semantic_constraint.py`` (eqs 2-8) and ``refinement/semantics.py`` (eqs 12-13).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from artemis_edge.block_store import CLASSES, LOG_CLASS, WEIGHT, Store
+from artemis_edge.class_rows import CLEAR_LOG
+from artemis_edge.config import SemanticsConfig
+from artemis_edge.errors import InputError
+from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraImage
+from artemis_edge.paging import resident_blocks
+from artemis_edge.refinement.semantics import labels_of, refine
+from artemis_edge.segmentation.backend import DenseScores
+from artemis_edge.sight import Seen, Sight, compare_depth, look, new_seen, new_sight, splat_depth
+from artemis_edge.trajectory import inverse
+from artemis_edge.voxel_fusion import fuse, grid_of, sample_scores, start_from
+
+BACKGROUND = "background"
+_LEAST_COSINE = 0.05  # surfaces seen at a smaller one show a pixel of something else
+_SAME_SURFACE = 0.7  # cosine between normals
+
+
+@dataclass(frozen=True, slots=True)
+class LateMask:
+    """What a network saw in an image, and the view (pose, reference depth) of that image."""
+
+    sight: Sight
+    scores: DenseScores
+
+
+class Segmenter(Protocol):
+    """Where masks come from. Neither call waits for a network that runs beside the pipeline."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Classes asked for, from slot 1 on."""
+        ...
+
+    def offer(self, image: CameraImage, sight: Sight) -> None:
+        """An image that may be segmented."""
+        ...
+
+    def ready(self) -> list[LateMask]:
+        """Masks that are done."""
+        ...
+
+    def drain(self) -> list[LateMask]:
+        """Masks that are left at the end of a run; waits for them."""
+        ...
+
+
+class SemanticMap:
+    """Classes of one map's voxels and vertices."""
+
+    def __init__(self, config: SemanticsConfig, store: Store, voxel_m: float) -> None:
+        self.config = config
+        self.store = store
+        self.names: dict[int, str] = {0: BACKGROUND}
+        self.active = np.zeros(CLASSES, np.uint8)
+        self.active[0] = 1
+        self._block_m = 8 * voxel_m
+        self._spacing_m = voxel_m / 4
+        self._blocks = np.empty(len(store.block), np.int32)
+        self._seen = new_seen(len(store.state))
+        self._sampled = np.empty((len(store.state), CLASSES), np.float32)
+        self._reliability = np.empty(len(store.state), np.float32)
+        self._scratch = np.empty(CLASSES, np.float32)
+        self.probability = np.empty(0, np.float32)
+
+    def ask(self, names: Sequence[str]) -> None:
+        """The classes looked for, from slot 1 on; raises InputError for more than there are slots."""
+        if len(names) >= CLASSES:
+            raise InputError(f"{len(names)} classes were asked for; at most {CLASSES - 1} at a time")
+        self.names = {0: BACKGROUND} | dict(enumerate(names, start=1))
+        self.active[:] = 0
+        self.active[: len(names) + 1] = 1
+
+    def slots_of(self, names: Sequence[str]) -> U8:
+        """Which slots hold one of the classes, uint8 (CLASSES,)."""
+        out = np.zeros(CLASSES, np.uint8)
+        out[[slot for slot, name in self.names.items() if name in names]] = 1
+        return out
+
+    def sight(self, image: CameraImage, T_world_lidar: F64) -> Sight:
+        """The view of an image with the reference depth that the map has now."""
+        view = new_sight(image.model, T_world_lidar @ inverse(image.T_cam_lidar))
+        n = self._look(view)
+        splat_depth(self._seen, n, view.lens[0], self._spacing_m, view.depth)
+        return view
+
+    def fuse(self, mask: LateMask, stamp: int) -> int:
+        """Voxel fusion (eq. 1) of a mask; returns how many vertices it sees."""
+        n = self._look(mask.sight)
+        compare_depth(self._seen, n, mask.sight.depth)
+        sampled = self._rows(n, mask.scores)
+        sample_scores(self._seen, n, mask.scores.score, grid_of(mask.scores), sampled)
+        fuse(
+            self.store,
+            self._seen,
+            n,
+            sampled,
+            slot_layers(mask.scores),
+            self.config.sigma_d_m,
+            self._scratch,
+        )
+        return n
+
+    def refine(self, mask: LateMask, n: int, stamp: int) -> int:
+        """Semantic refinement (eqs 12, 13) by the mask that was fused last and saw ``n`` vertices."""
+        self._reliability[:n] = reliability(self._seen, n, self.config.sigma_geom)
+        return int(
+            refine(
+                self.store,
+                self._seen,
+                n,
+                self._rows(n, mask.scores),
+                slot_layers(mask.scores),
+                self._reliability,
+                stamp,
+                self._scratch,
+            )
+        )
+
+    def finished_labels(self, lam: F32, normals: F32, faces: I32) -> U8:
+        """Labels (n,) of a finished mesh from log-probabilities (n, CLASSES).
+
+        A vertex that no image saw takes its class from the seen surface around it, up to ``spread_rings`` edges
+        away and not around corners. ``probability`` (n,) is then that of each seen vertex' class, 0 of others.
+        """
+        label, probability = np.zeros(len(lam), np.uint8), np.zeros(len(lam), np.float32)
+        labels_of(lam, self.active, label, probability, self._scratch)
+        self.probability = probability
+        return spread_labels(label, probability > 0.0, normals, faces, self.config.spread_rings)
+
+    def _look(self, sight: Sight) -> int:
+        blocks = self._blocks[: resident_blocks(self.store, self._blocks)]
+        return int(look(self.store, sight, blocks, self._block_m, self.config.reach_m, self._seen))
+
+    def _rows(self, n: int, scores: DenseScores) -> F32:
+        layers = scores.score.shape[2]
+        return self._sampled.reshape(-1)[: n * layers].reshape(n, layers)
+
+
+def reliability(seen: Seen, n: int, sigma_geom: float) -> F32:
+    """W of eq. 9 float32 (n,) from the depth alone: r_geom of eq. 11 of the vertices in view; 0 seen from behind."""
+    error = seen.depth_error[:n]
+    relative = error / (np.maximum(seen.z[:n] - error, 0.1) * sigma_geom)
+    weight: F32 = np.exp(-0.5 * relative * relative) * (seen.cosine[:n] > _LEAST_COSINE)
+    return weight.astype(np.float32, copy=False)
+
+
+def slot_layers(scores: DenseScores) -> I32:
+    """The layer of each slot, int32 (CLASSES,); -1 where it was not asked for."""
+    out = np.full(CLASSES, -1, np.int32)
+    for layer, slot in enumerate(scores.slots):
+        out[slot] = layer
+    return out
+
+
+def start_blank(lam: F32, voxel_class: F32) -> None:
+    """Rows of ``lam`` (n, CLASSES) that are all 0 start from their voxels' sums (n, CLASSES + 1)."""
+    rows = np.flatnonzero(~lam.any(axis=1) & (voxel_class[:, WEIGHT] > 0.0))
+    attribute = np.zeros(LOG_CLASS + CLASSES, np.float32)
+    for row in rows:
+        start_from(attribute, voxel_class[row])
+        lam[row] = attribute[LOG_CLASS:]
+
+
+def clear_classes(lam: F32) -> I32:
+    """The class each row of ``lam`` (n, CLASSES) clearly has (class_rows.py), int32 (n,); -1 where none."""
+    most = lam.max(axis=1)
+    second = np.where(lam < most[:, None], lam, -np.inf).max(axis=1)
+    clear = np.isfinite(second) & (most - second >= CLEAR_LOG)
+    return np.where(clear, lam.argmax(axis=1), -1).astype(np.int32)
+
+
+def spread_labels(label: U8, known: Bool, normals: F32, faces: I32, rings: int) -> U8:
+    """Labels of the vertices that are not ``known``, ring by ring over edges between like normals; of several
+    neighbours' classes the most frequent, of equally frequent ones the lowest."""
+    label, known = label.copy(), known.copy()
+    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    edges = np.unique(np.concatenate((edges, edges[:, ::-1])), axis=0)
+    edges = edges[~known[edges[:, 1]]]
+    edges = edges[np.einsum("ij,ij->i", normals[edges[:, 0]], normals[edges[:, 1]]) > _SAME_SURFACE]
+    for _ in range(rings):
+        ready = known[edges[:, 0]]
+        if not ready.any():
+            break
+        votes = np.bincount(
+            edges[ready, 1].astype(np.int64) * CLASSES + label[edges[ready, 0]],
+            minlength=len(label) * CLASSES,
+        ).reshape(-1, CLASSES)
+        reached = votes.any(axis=1)
+        label[reached] = votes[reached].argmax(axis=1)
+        known |= reached
+        edges = edges[~known[edges[:, 1]]]
+    return label
+
+
+def active_slots(names: dict[int, str]) -> U8:
+    """Which slots hold a class, uint8 (CLASSES,)."""
+    out = np.zeros(CLASSES, np.uint8)
+    out[list(names)] = 1
+    return out
