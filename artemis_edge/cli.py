@@ -200,6 +200,11 @@ def _reprocess(commands: Any) -> None:
         help="what to find, for example 'red car'; may be repeated",
     )
     parser.add_argument(
+        "--dynamic-filter",
+        action="store_true",
+        help="leave out what moved; it is kept apart in map/removed.ply",
+    )
+    parser.add_argument(
         "--model", default="", metavar="NAME", help="network that looks for it ('models list')"
     )
     _json_option(parser)
