@@ -125,7 +125,7 @@ class LiveMapper:
         if self.channel.closed:
             raise ServiceGoneError
         if self.viewers is not None and self.viewers.turn():
-            _call(self.mapping.mapper, "tell_everything")
+            self.mapping.mapper.tell_again()
         self._say("mapping")
 
     def _reopen(self) -> None:
