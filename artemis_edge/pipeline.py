@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from artemis_edge.block_store import CLASSES, LOG_CLASS, REFUSED_POINTS
+from artemis_edge.block_store import CHANGED, CLASSES, LOG_CLASS, REFUSED_POINTS
 from artemis_edge.config import Config
 from artemis_edge.delta import Outbox
 from artemis_edge.export.atlas import write_atlas
@@ -79,6 +79,10 @@ class Pipeline:
             self.pager.make_room(self._stamp)
         self.trajectory.append((tracked.stamp_ns, tracked.T_world_lidar))
         return delta
+
+    def tell_everything(self) -> None:
+        """A viewer is new: all blocks in memory are told again, as the coming frames have room."""
+        self.voxel_map.store.block[self.pager.resident(), CHANGED] = 1
 
     def finish(self) -> MeshDelta:
         """Everything postponed; the delta holds all that was not told yet."""

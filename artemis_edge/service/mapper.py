@@ -125,7 +125,7 @@ class LiveMapper:
         if self.channel.closed:
             raise ServiceGoneError
         if self.viewers is not None and self.viewers.turn():
-            self.mapping.mapper.tell_again()
+            self.mapping.mapper.tell_everything()
         self._say("mapping")
 
     def _reopen(self) -> None:
