@@ -201,3 +201,14 @@ def test_which_odometry_a_rig_gets(walk):
     assert isinstance(odometry_for(CONFIG, lambda: iter([])), LidarOdometry)
     in_g = replace(walk[0].imu, accel=walk[0].imu.accel / 9.81)
     assert fast_enough(walk[0].imu) and not fast_enough(in_g)
+
+
+def test_a_place_never_seen_is_mapped_where_the_imu_has_it(walk):
+    """As behind a door: from one frame on nothing of the map is in sight."""
+    inside = np.array([[-2.0, -2.5, -0.5, -1.5, 3.0, 3.0], [6.0, -2.5, -0.5, 6.5, 3.0, 3.0]])
+    inside = np.vstack([inside, [[-2.0, -2.5, -0.5, 6.5, -2.0, 3.0], [-2.0, 2.5, -0.5, 6.5, 3.0, 3.0]]])
+    inside = np.vstack([inside, [[-2.0, -2.5, 2.6, 6.5, 3.0, 3.0], [-2.0, -2.5, -0.5, 6.5, 3.0, 0.3]]])
+    room = [replace(f, imu=walk[f.index].imu) for f in (frame(k, hand, inside) for k in range(14, 22))]
+    tracked, odometry = track([*walk[:14], *room])
+    assert errors_m(tracked, hand).max() < 0.05
+    assert odometry.lost == {"not registered": 1}

@@ -36,6 +36,7 @@ _LOST = 0.4  # share of the usual score below which the update is not believed
 _MEMORY = 0.1  # weight of a new frame in the usual score
 _ITERATIONS = 8
 _CONVERGED = 2e-4  # m and rad
+_SURE_M = 0.1  # expected miss at the points up to which the IMU's word is as good as a registration
 _SAME_TIME_S = 1e-3  # frames that share a stamp are taken to be a millisecond apart
 _KEPT_NS = 200_000_000  # samples kept behind the state, so that its own time can be interpolated
 _GIVE_UP = 10  # frames lost in a row after which the map is begun anew at the predicted pose
@@ -182,12 +183,15 @@ class InertialOdometry:
         return state
 
     def _add(self, arrived: _Arrived, state: State, registered: bool) -> None:
-        """Add a registered scan to the map where the state has it; after many that were not begin a new map."""
+        """Add a scan to the map where the state has it; after many that were not registered begin a new map.
+
+        A scan that was not registered is added if the IMU alone knows where: it may show what was never seen.
+        """
         points = arrived.points(arrived.scan.dense, state)
         T = arrived.path.at(state, 0.0).T_world_lidar
         if len(self._map.planes) == 0:
             self._map.begin(points, T)
-        elif registered:
+        elif registered or expected_miss_m(state, arrived.path, arm_m(points)) < _SURE_M:
             self._lost_in_a_row = 0
             if refused := self._map.add(points, T):
                 self._count("points without room in the local map", refused)
