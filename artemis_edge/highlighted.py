@@ -62,7 +62,8 @@ def _same(name: str, text: str) -> bool:
 def _in_object(mesh: Mesh, found: dict[str, Any]) -> Bool:
     """Triangles whose middle lies in the object's box and which, where its class has a label, bear it."""
     inside = _in_box(mesh, found["box"])
-    labels = [n for n, name in mesh.label_names.items() if n and _same(name, str(found.get("text", "")))]
+    kind = str(found.get("class", found.get("text", "")))
+    labels = [n for n, name in mesh.label_names.items() if n and _same(name, kind)]
     return inside & np.isin(face_labels(mesh), labels) if labels else inside
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from artemis_edge import ask
 from artemis_edge.errors import InputError
 from artemis_edge.frames import Bool
 from artemis_edge.highlighted import highlighted_triangles
@@ -19,9 +20,9 @@ _TRAJECTORY = "trajectory.tum"
 
 
 class FinishedView:
-    """Serves a map until closed; ``ask`` answers the query box (None: what the map itself knows)."""
+    """Serves a map until closed; ``answer`` answers the query box (None: the map and its photographs)."""
 
-    def __init__(self, map_path: Path, host: str, port: int, ask: Ask | None = None) -> None:
+    def __init__(self, map_path: Path, host: str, port: int, answer: Ask | None = None) -> None:
         self._mesh, self._atlas = open_map(map_path)
         if len(self._mesh.faces) == 0:
             raise InputError(f"{map_path} has no triangles; there is nothing to see")
@@ -32,7 +33,7 @@ class FinishedView:
         low, high = np.percentile(vertices, 2, axis=0), np.percentile(vertices, 98, axis=0)
         self.browser.look_at(low.astype(np.float32), high.astype(np.float32))
         self._show_trajectory()
-        self.browser.add_query(ask or self._known, lambda triangles: self.highlight(triangles))
+        self.browser.add_query(answer or self._answer, lambda triangles: self.highlight(triangles))
         self.browser.note().content = f"{len(self._mesh.faces):,} triangles, {len(vertices):,} vertices"
         self.show(self.browser.kind)
 
@@ -49,9 +50,24 @@ class FinishedView:
         """Mark triangles, or none."""
         self.browser.highlight(self._mesh, triangles)
 
-    def _known(self, text: str) -> Answer:
-        found = highlighted_triangles(self._map_path, self._mesh, text)
+    def _answer(self, text: str) -> Answer:
+        """What the map already knows, else what its photographs tell."""
+        try:
+            found = highlighted_triangles(self._map_path, self._mesh, text)
+        except InputError as unknown:
+            return self._look(text, unknown)
         return Answer(f"'{text}': {int(found.sum()):,} triangles", found)
+
+    def _look(self, text: str, unknown: InputError) -> Answer:
+        try:
+            replies = ask.ask(self._map_path, [text])
+        except InputError as fault:
+            return Answer(f"{unknown}; its photographs cannot be asked: {fault}")
+        triangles = np.zeros(len(self._mesh.faces), bool)
+        for reply in replies:
+            for found in reply.found:
+                triangles[found.item.triangles] = True
+        return Answer(ask.to_text(replies), triangles)
 
     def _show_trajectory(self) -> None:
         root = self._map_path if self._map_path.is_dir() else self._map_path.parent
