@@ -144,6 +144,9 @@ def _demo(commands: Any) -> None:
     )
     parser.add_argument("--out", type=Path, default=DEMO_OUT, metavar="DIR", help="default: ./demo-out")
     parser.add_argument(
+        "--query", action="append", default=[], metavar="TEXT", help="what to look for; may be repeated"
+    )
+    parser.add_argument(
         "--tui",
         action=argparse.BooleanOptionalAction,
         default=False,
@@ -266,11 +269,11 @@ def _at_least_two(text: str) -> int:
 
 def run_demo(given: argparse.Namespace) -> int:
     """``artemis-edge demo``."""
-    from artemis_edge.session.demo import demo
+    from artemis_edge.session.demo import QUERIES, demo
 
     if given.tui:
         return tui.run_demo(given, _SEED)
-    print(demo(given.world, given.seconds, _SEED, given.out))
+    print(demo(given.world, given.seconds, _SEED, given.out, queries=given.query or QUERIES))
     return DONE
 
 

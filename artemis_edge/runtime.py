@@ -39,7 +39,8 @@ from artemis_edge.trajectory import hole_sentence, pose_per_frame, read_tum, wri
 _WARM_UP_FRAMES = 3
 _WARM_UP_MB = 600
 
-MakeMapper = Callable[[Config, Odometry, Path], Mapper]
+#: Called with configuration, odometry, folder for pages and, where questions need a network, what asks it.
+MakeMapper = Callable[..., Mapper]
 #: What is measured of a finished map, for the report; None where there is no truth.
 Evaluate = Callable[[Mesh, Trajectory], Evaluation]
 
@@ -153,11 +154,11 @@ class Answering:
     def mapper(self, make: MakeMapper, odometry: Odometry, pages: Path) -> Mapper:
         """The mapper of the run, with the network at work where a question needs it."""
         config = self._request.config
-        if self.questions is None or not self.questions.names or make is not pipeline:
+        if self.questions is None or not self.questions.names:
             return make(config, odometry, pages)
         rule = config.segmentation
         self._masks = self.questions.segmenter(every(rule.every, rule.delay_frames))
-        return pipeline(config, odometry, pages, self._masks)
+        return make(config, odometry, pages, self._masks)
 
     def between(self, prepare: Callable[[SyncedFrame], SyncedFrame]) -> Callable[[SyncedFrame], SyncedFrame]:
         """``prepare``, which is called before every frame, after the masks that the frame will need are there."""

@@ -25,7 +25,10 @@ class Stream(Struct, frozen=True):
 
 
 class QueryStatus(Struct, frozen=True):
-    """A live question: ``status`` searching, matched, approximate, unsupported or not found."""
+    """A live question: ``status`` searching, matched, approximate, unsupported or not found.
+
+    ``labels`` are those of the vertices that are highlighted for it.
+    """
 
     text: str
     status: str = "searching"
@@ -34,6 +37,7 @@ class QueryStatus(Struct, frozen=True):
     colour: tuple[int, int, int] = (255, 200, 0)
     note: str = ""
     places: list[tuple[float, float, float]] = []
+    labels: list[int] = []
 
 
 class SyncStatus(Struct, frozen=True):

@@ -21,8 +21,9 @@ from artemis_edge.newest import Newest, joined
 from artemis_edge.status import MapStatus, QueryStatus, Status, Stream, SyncStatus
 from artemis_edge.tui.app import ArtemisTui, LivePage
 from artemis_edge.tui.history import History
+from artemis_edge.tui.live_questions import LiveQuestions
 from artemis_edge.tui.pages import recordings
-from artemis_edge.tui.picture import SKY, MapCopy, draw, luminance_text
+from artemis_edge.tui.picture import SKY, MapCopy, draw, found_in, luminance_text
 from artemis_edge.tui.remote import RemoteError
 from artemis_edge.tui.socket_remote import SocketRemote
 from artemis_edge.tui.widgets import MeshPicture, advice, frame_times, gauges
@@ -417,3 +418,32 @@ def test_the_service_is_asked_over_its_socket(tmp_path: Path) -> None:
     finally:
         again.close()
         remote.close()
+
+
+def test_a_question_of_labels_is_counted_in_the_map() -> None:
+    rng = np.random.default_rng(1)
+    copy = MapCopy()
+    copy.apply(delta((0, 0, 0), rng.uniform(0, 1, (100, 3)), 3))
+    copy.apply(delta((5, 0, 0), rng.uniform(0, 1, (60, 3)) + np.array([10, 0, 0]), 3))
+    copy.apply(delta((9, 0, 0), np.full((5, 3), 30.0), 3))
+    copy.apply(delta((0, 9, 0), rng.uniform(0, 1, (90, 3)) + np.array([0, 20, 0]), 4))
+    found = found_in(copy, QueryStatus("car", "matched", labels=[3]))
+    assert found.count == 2, "five vertices are a stray mask"
+    assert found.status == "matched"
+    np.testing.assert_allclose(sorted(p[0] for p in found.places), (0.5, 10.5), atol=0.2)
+    nothing = found_in(copy, QueryStatus("dog", "matched", labels=[7]))
+    assert nothing.count == 0 and nothing.status == "searching"
+
+
+def test_live_questions_choose_among_what_is_looked_for() -> None:
+    live = LiveQuestions(["car", "tree"])
+    live.order("ask", "trees")
+    live.order("ask", "unicorn")
+    live.order("ask", "person")
+    live.order("mark", "")
+    trees, unicorn, person = live.told()
+    assert trees.labels == [2] and trees.status == "matched"
+    assert unicorn.status == person.status == "unsupported"
+    assert len({q.colour for q in live.told()}) == 3
+    live.order("forget", "unicorn")
+    assert [q.text for q in live.told()] == ["trees", "person"]

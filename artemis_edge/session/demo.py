@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +24,8 @@ from artemis_edge.session.truth import evaluate_against_world, read_moving, read
 from artemis_edge.trajectory import inverse, read_tum
 
 SESSION = "session"
+# What the demo asks for by itself: classes that the shipped network knows
+QUERIES = ("car", "person", "bench", "tree")
 # Measuring within 10 cm thins the reference to 5 cm anyway.
 _SETTINGS = {"reference_spacing_m": "0.04", "image_width": "640"}
 # How far an Avia's points lie close enough together to carry a mesh at the default spacing.
@@ -41,6 +43,7 @@ def demo(
     out: Path,
     make: MakeMapper = pipeline,
     reporter: Reporter = progress,
+    queries: Sequence[str] = QUERIES,
 ) -> str:
     """Write session and results to ``out``; returns what to print. Raises UserError as its parts do."""
     prepare(out)
@@ -52,7 +55,7 @@ def demo(
     for note in made.notes:
         say(f"note: {note}")
     say("mapping it by its own odometry (the truth is only for measuring)")
-    request = Request(session, out, own_odometry=True)
+    request = Request(session, out, own_odometry=True, queries=tuple(queries))
     with reporter("mapping") as report:
         outcome = reprocess(request, report, lambda mesh, path: measure(mesh, path, made.truth), make)
     return _closing(outcome, made.length_m)
@@ -110,6 +113,7 @@ def _closing(outcome: Outcome, length_m: float) -> str:
     report = outcome.report
     rows = [*_measured(report["evaluation"], length_m), *_cost(report)]
     rows += [
+        ("asked for", _answers(report)),
         ("mesh", str(outcome.out / "mesh.ply")),
         ("mesh for viewers", str(outcome.out / "mesh.glb")),
         ("report", str(outcome.out / "report.html")),
@@ -146,6 +150,14 @@ def _measured(found: dict[str, Any], length_m: float) -> list[tuple[str, str]]:
             f"levelled to {world['levelling_error_deg']:.2f} degrees",
         ),
     ]
+
+
+def _answers(report: dict[str, Any]) -> str:
+    """How many were found of each question."""
+    told = [
+        f"{q['text']}: {q.get('count', q.get('objects', 0)) or 'none'}" for q in report.get("queries", [])
+    ]
+    return ", ".join(told) or "nothing"
 
 
 def _percent(share: float | None) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
+from msgspec.structs import replace
 from textual import on, work
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
@@ -21,7 +22,7 @@ from textual.widgets import DataTable, Footer, Header, Input, Static
 from artemis_edge.status import Status
 from artemis_edge.tui.history import History
 from artemis_edge.tui.pages import ChecksPage, HelpPage, SessionsPage
-from artemis_edge.tui.picture import Kind, MapCopy, draw
+from artemis_edge.tui.picture import Kind, MapCopy, draw, found_in
 from artemis_edge.tui.remote import Remote, RemoteError
 from artemis_edge.tui.widgets import Advice, FrameTimes, Gauges, MeshPicture, Queries, Streams
 
@@ -91,6 +92,7 @@ class LivePage(Screen[None]):
 
     def show(self, status: Status) -> None:
         """Take over a new status."""
+        status = replace(status, queries=[found_in(self._copy, q) for q in status.queries])
         self._status = status
         self.query_one(Gauges).show(status)
         self.query_one(FrameTimes).show(status)
@@ -105,7 +107,7 @@ class LivePage(Screen[None]):
             return
         width, height = picture.pixels
         at = self._look_at or self._status.position
-        colours = {k + 1: q.colour for k, q in enumerate(self._status.queries)}
+        colours = {label: q.colour for q in self._status.queries for label in q.labels}
         picture.caption = f"{'from above' if self.view == 'above' else 'from behind'}, {self.span_m:.0f} m"
         picture.show(draw(self._copy, width, height, at, self._status.yaw, self.view, self.span_m, colours))
 

@@ -24,7 +24,9 @@ from artemis_edge.frames import MeshDelta, Odometry, SyncedFrame
 from artemis_edge.newest import Newest
 from artemis_edge.pipeline import Pipeline
 from artemis_edge.progress import Report
+from artemis_edge.semantic_map import Segmenter
 from artemis_edge.status import MapStatus, Status, Stream
+from artemis_edge.tui.live_questions import EVERY_CLASS, LiveQuestions
 from artemis_edge.tui.remote import RemoteError
 
 _SEND_EVERY_S = 0.2
@@ -174,8 +176,16 @@ class Teller:
 class WatchedPipeline(Pipeline):
     """The pipeline at the pace of the recording, telling what it does."""
 
-    def __init__(self, config: Config, odometry: Odometry, folder: Path, teller: Teller) -> None:
-        super().__init__(config, odometry, folder)
+    def __init__(
+        self,
+        config: Config,
+        odometry: Odometry,
+        folder: Path,
+        teller: Teller,
+        segmenter: Segmenter | None,
+    ) -> None:
+        super().__init__(config, odometry, folder, segmenter)
+        self._live = LiveQuestions([] if segmenter is None else list(segmenter.names))
         self._teller = teller
         self._due = 0.0
         self._frames = 0
@@ -201,6 +211,8 @@ class WatchedPipeline(Pipeline):
         return delta
 
     def _tell(self, frame: SyncedFrame) -> None:
+        while self._teller.orders:
+            self._live.order(*self._teller.orders.popleft())
         T = self.trajectory[-1][1]
         points = sum(len(scan.points) for scan in frame.scans)
         counter = self.voxel_map.store.counter
@@ -213,6 +225,7 @@ class WatchedPipeline(Pipeline):
             state="replaying",
             frames=self._frames,
             streams=streams,
+            queries=self._live.told(),
             position=tuple(float(v) for v in T[:3, 3]),
             yaw=float(np.arctan2(T[1, 0], T[0, 0])),
             map=MapStatus(
@@ -228,25 +241,29 @@ class _Make:
     def __init__(self, teller: Teller) -> None:
         self._teller, self._made = teller, 0
 
-    def __call__(self, config: Config, odometry: Odometry, folder: Path) -> Pipeline:
+    def __call__(
+        self, config: Config, odometry: Odometry, folder: Path, segmenter: Segmenter | None = None
+    ) -> Pipeline:
         self._made += 1
         if self._made == 1:
             self._teller.say(
                 message="getting ready; the very first time takes a minute or two", frames_total=0
             )
-            return Pipeline(config, odometry, folder)
-        return WatchedPipeline(config, odometry, folder, self._teller)
+            return Pipeline(config, odometry, folder, segmenter)
+        return WatchedPipeline(config, odometry, folder, self._teller, segmenter)
 
 
 def _child(pipe: Connection, world: str, seconds: float, seed: int, out: Path, queries: list[str]) -> None:
     """Record, map, tell; the terminal belongs to the parent, so nothing is printed."""
     with Path(os.devnull).open("w") as sink, redirect_stdout(sink), redirect_stderr(sink):
-        _demo(Teller(pipe), world, seconds, seed, out)
+        _demo(Teller(pipe), world, seconds, seed, out, queries)
 
 
-def _demo(teller: Teller, world: str, seconds: float, seed: int, out: Path) -> None:
+def _demo(teller: Teller, world: str, seconds: float, seed: int, out: Path, queries: list[str]) -> None:
     from artemis_edge.errors import UserError
     from artemis_edge.session.demo import demo
+
+    teller.orders.extend(("ask", text) for text in queries)
 
     @contextlib.contextmanager
     def report(label: str) -> Iterator[Report]:
@@ -261,6 +278,7 @@ def _demo(teller: Teller, world: str, seconds: float, seed: int, out: Path) -> N
             world, seconds, seed, out,
             make=_Make(teller),
             reporter=report,
+            queries=list(dict.fromkeys([*queries, *EVERY_CLASS])),
         )  # fmt: skip
     except UserError as error:
         interrupted = teller.stop.is_set() and (out / "report.html").exists()

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from msgspec.structs import replace
 
 from artemis_edge.frames import F32, F64, I64, U8, MeshDelta
+from artemis_edge.status import QueryStatus
 
 Kind = Literal["behind", "above"]
 
@@ -20,6 +22,8 @@ _GREY = 180
 _DIM = 0.45  # what is not asked for steps back while something is highlighted
 _TILT = np.deg2rad(35.0)  # how steeply one looks down from behind
 _BEHIND_M = 9.0
+_PIECE_M = 0.5  # vertices of a class this near to each other are one thing
+_LEAST_PIECE = 20  # fewer are a stray mask
 _FOV = 1.1  # focal length over half the width: 85 degrees across
 
 
@@ -76,6 +80,49 @@ def _shaded(colour: U8, normal: F32) -> U8:
     wall, floor = np.array([150, 165, 190], np.float32), np.array([140, 170, 130], np.float32)
     out[grey] = (light * (wall * (1.0 - up) + floor * up)).astype(np.uint8)
     return out
+
+
+def found_in(copy: MapCopy, query: QueryStatus) -> QueryStatus:
+    """A question that tells labels only, with the pieces that the map shows of them: count and places."""
+    if not query.labels or query.places:
+        return query
+    points, _, label = copy.points()
+    rows = points[np.isin(label, query.labels)]
+    cells, count = np.unique(np.floor(rows / _PIECE_M).astype(np.int64), axis=0, return_counts=True)
+    image = {tuple(c): int(n) for c, n in zip(cells.tolist(), count.tolist(), strict=True)}
+    places = [
+        _middle(rows, piece) for piece in _pieces(image) if sum(image[c] for c in piece) >= _LEAST_PIECE
+    ]
+    status = query.status if places else "searching"
+    return replace(query, count=len(places), places=places, status=status)
+
+
+def _pieces(cells: dict[tuple[int, ...], int]) -> list[list[tuple[int, ...]]]:
+    """Groups of cells that touch, the largest first."""
+    left, found = dict(cells), []
+    around = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
+    while left:
+        piece, edge = [], [left.popitem()[0]]
+        while edge:
+            cell = edge.pop()
+            piece.append(cell)
+            for step in around:
+                near = tuple(a + b for a, b in zip(cell, step, strict=True))
+                if left.pop(near, None) is not None:
+                    edge.append(near)
+        found.append(sorted(piece))
+    return sorted(found, key=lambda piece: (-len(piece), piece[0]))
+
+
+def _middle(rows: F32, piece: list[tuple[int, ...]]) -> tuple[float, float, float]:
+    own = np.isin(_code(np.floor(rows / _PIECE_M)), _code(np.array(piece, np.float64)))
+    x, y, z = rows[own].mean(axis=0).tolist()
+    return x, y, z
+
+
+def _code(cells: F64 | F32) -> F64:
+    code: F64 = np.asarray(cells, np.float64) @ np.array([1e8, 1e4, 1.0])
+    return code
 
 
 def draw(
