@@ -154,9 +154,7 @@ def _measured(found: dict[str, Any], length_m: float) -> list[tuple[str, str]]:
 
 def _answers(report: dict[str, Any]) -> str:
     """How many were found of each question."""
-    told = [
-        f"{q['text']}: {q.get('count', q.get('objects', 0)) or 'none'}" for q in report.get("queries", [])
-    ]
+    told = [f"{q['text']} {len(q['objects']) or q['status']}" for q in report.get("queries", [])]
     return ", ".join(told) or "nothing"
 
 
