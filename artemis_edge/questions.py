@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -66,6 +66,20 @@ def unanswered(questions: Questions, reason: str) -> list[Reply]:
         Reply(q.query.text, Status.UNSUPPORTED, q.reason if not q.classes else reason, ())
         for q in questions.asked
     ]
+
+
+def every_image(count: int, delay: int) -> Schedule:
+    """Every ``count``-th image of each camera, the first included, handed over ``delay`` turns later.
+
+    By images and not by turns: a camera may bring one every other frame.
+    """
+    offered: Counter[str] = Counter()
+
+    def due(turn: int, image: CameraImage) -> int | None:
+        offered[image.name] += 1
+        return turn + max(delay, 1) if (offered[image.name] - 1) % count == 0 else None
+
+    return due
 
 
 @dataclass(slots=True)

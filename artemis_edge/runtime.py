@@ -27,8 +27,7 @@ from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, readable, wa
 from artemis_edge.odometry.choice import OwnOdometry, odometry_for
 from artemis_edge.odometry.given_poses import GivenPoses
 from artemis_edge.progress import Report, silent
-from artemis_edge.questions import BlankMasks, Questions, ScheduledMasks, unanswered
-from artemis_edge.segmentation.worker import every
+from artemis_edge.questions import BlankMasks, Questions, ScheduledMasks, every_image, unanswered
 from artemis_edge.semantic_map import Segmenter
 from artemis_edge.session.photos import INDEX, HeldOut
 from artemis_edge.session.report import Evaluation, RunStatistics, write_report
@@ -157,7 +156,7 @@ class Answering:
         if self.questions is None or not self.questions.names:
             return make(config, odometry, pages)
         rule = config.segmentation
-        self._masks = self.questions.segmenter(every(rule.every, rule.delay_frames))
+        self._masks = self.questions.segmenter(every_image(rule.every, rule.delay_frames))
         return make(config, odometry, pages, self._masks)
 
     def between(self, prepare: Callable[[SyncedFrame], SyncedFrame]) -> Callable[[SyncedFrame], SyncedFrame]:

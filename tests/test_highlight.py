@@ -7,7 +7,9 @@ import pytest
 
 from artemis_edge.export.mesh import Mesh, bare_mesh
 from artemis_edge.export.objects import object_mesh, objects_json, queries_json
+from artemis_edge.frames import CameraImage, CameraModel
 from artemis_edge.highlight import answer, objects_of, pieces, upright_box
+from artemis_edge.questions import every_image
 from artemis_edge.segmentation.attribute import NAME
 from artemis_edge.segmentation.registry import open_by_name
 from artemis_edge.segmentation.resolve import understand
@@ -70,3 +72,9 @@ def test_answers_are_ranked_and_what_is_unsure_is_not_claimed() -> None:
     assert [q["status"] for q in queries_json([car, person, nonsense])][1:] == ["not_found", "unsupported"]
     alone = object_mesh(mesh, car.found[0])
     assert len(alone.vertices) == 4 and alone.vertices[:, 0].min() == 3.0
+
+
+def test_every_second_image_of_a_camera_is_due_whatever_frame_it_comes_in() -> None:
+    due = every_image(2, 3)
+    image = CameraImage("cam_0", 0, b"", CameraModel(8, 8, 8.0, 8.0, 4.0, 4.0), np.eye(4))
+    assert [due(turn, image) for turn in (1, 3, 5, 7)] == [4, None, 8, None]

@@ -72,12 +72,15 @@ class TrueMasks:
         size = 2 * round(self._spoilt.dilated_px / _SHARE) + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
         sure = round(_SURE * FULL_SCORE)
-        for number in np.unique(instance[mask > 0]):
+        numbers, size_px = np.unique(instance[mask > 0], return_counts=True)
+        # where grown masks overlap the smaller object is on top, as networks draw them
+        for number in numbers[np.argsort(-size_px, kind="stable")]:
             here = (instance == number) & (mask > 0)
             slot = int(np.bincount(mask[here]).argmax())
             if rng.random() < self._spoilt.wrong:
                 slot = int(rng.choice([k for k in range(1, slots) if k != slot]))
             grown = cv2.dilate(here.astype(np.uint8), kernel) > 0
+            score[grown] = 0
             score[grown, slot] = sure
         score[(score == 0).all(axis=2), 0] = sure
 
