@@ -35,6 +35,7 @@ from artemis_edge.service.outlet import Outlet
 from artemis_edge.service.rig import Rig, make_rig
 from artemis_edge.service.settings import RunConfig
 from artemis_edge.service.status_view import StatusView
+from artemis_edge.session.feed import recorded
 from artemis_edge.session.files import NAME
 from artemis_edge.session.message_ring import MessageRing
 
@@ -111,7 +112,7 @@ class Daemon:
             self.rig: Rig = make_rig(config, own_addresses)
         except DriverError as error:
             raise InputError(str(error)) from None
-        self.outlet = Outlet(MessageRing.create(config.service.ring_mb))
+        self.outlet = Outlet(MessageRing.create(config.service.ring_mb, _next_number(self.wanted.go_on)))
         self.capture = Capture(self.rig, self.outlet)
         self._view = StatusView(config)
         self.control = ControlSocket(
@@ -424,6 +425,11 @@ class Daemon:
             raise InputError(f"{folder} is there already; give another name")
         self._begin_checking(folder)
         return {"phase": str(self.phase)}
+
+
+def _next_number(session: Path | None) -> int:
+    """After the last message of a session that is to be continued."""
+    return 0 if session is None else max((sent.number + 1 for sent in recorded(session, 0)), default=0)
 
 
 def _line(event: dict[str, Any]) -> str:

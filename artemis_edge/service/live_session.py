@@ -45,6 +45,7 @@ class LiveSession:
         self.recorder_restarts = self.mapper_restarts = 0
         self._tell, self._about = tell, about
         self._first = self._stop_at = 0
+        self._out = folder / RESULT
         self._adopted: set[int] = set()
         self.recorder_last: dict[str, Any] = {}
         self.mapper_last: dict[str, Any] = {}
@@ -60,6 +61,7 @@ class LiveSession:
                 f"cannot make the session {self.folder}: {error.strerror}; choose another --session"
             ) from None
         _adopt_orphans()
+        self._out = result_folder(self.folder)
         self._first = self.outlet.open(self.config, self._about)
         self.recorder = self._start_recorder(self._first)
         if self.config.service.mapping:
@@ -132,7 +134,7 @@ class LiveSession:
     def _start_mapper(self) -> Child:
         task = MapperTask(
             str(self.folder),
-            str(self.folder / RESULT),
+            str(self._out),
             self._first,
             mapping_config.to_toml(self.config.mapping),
             self.config.service.checkpoint_s,
@@ -206,6 +208,14 @@ class LiveSession:
                 ended = pid
             if ended:
                 self._adopted.discard(pid)
+
+
+def result_folder(session: Path) -> Path:
+    """Where the map goes: ``result``, of a session that was continued ``result_2`` and so on."""
+    folder, number = session / RESULT, 2
+    while folder.exists():
+        folder, number = session / f"{RESULT}_{number}", number + 1
+    return folder
 
 
 def session_folder(sessions: Path, now: datetime) -> Path:

@@ -63,12 +63,14 @@ class MessageRing:
         self._fence = threading.Lock()
 
     @classmethod
-    def create(cls, megabytes: float) -> MessageRing:
-        """A new ring with room for about so many MB of messages."""
+    def create(cls, megabytes: float, first: int = 0) -> MessageRing:
+        """A new ring with room for about so many MB of messages, the next of which has number ``first``."""
         descriptor = os.memfd_create("artemis-messages")
         room = max(1 << 16, int(megabytes * 1e6) // _ALIGNMENT * _ALIGNMENT)
         os.ftruncate(descriptor, _COUNTS + PLACES * 8 + room)
-        return cls(descriptor)
+        ring = cls(descriptor)
+        ring._count[_PUBLISHED] = ring._count[_OLDEST] = first
+        return ring
 
     @property
     def published(self) -> int:

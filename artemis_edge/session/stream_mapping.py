@@ -14,13 +14,13 @@ import numpy as np
 
 from artemis_edge import topics
 from artemis_edge.config import Config, to_toml
-from artemis_edge.errors import InputError
+from artemis_edge.errors import InputError, RunError
 from artemis_edge.frames import MeshDelta, SyncedFrame, Trajectory
 from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Mapper
-from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.runtime import MakeMapper, pipeline, write_results
 from artemis_edge.session.assembly import FrameAssembler
+from artemis_edge.session.late_odometry import LOOKED_AT, LateOdometry
 from artemis_edge.session.message_ring import Sent
 from artemis_edge.session.messages import (
     CameraInfo,
@@ -53,12 +53,13 @@ class StreamMapping:
     def __init__(self, config: Config, pages: Path, make: MakeMapper = pipeline, name: str = "live") -> None:
         self.config = config
         self.assembler = FrameAssembler()
-        self.odometry = LidarOdometry(config.odometry)
+        self.odometry = LateOdometry(config.odometry)
         self.mapper: Mapper = make(config, self.odometry, pages)
         self.keeper = Keeper(pages, config.keep, config.segmentation)
         self._prepare = self.keeper.between(lambda frame: frame, self.mapper)
         self.statistics = RunStatistics(name, _INPUT_HZ, config_toml=to_toml(config))
         self.skip: set[int] = set()
+        self._first: list[SyncedFrame] | None = []  # until the odometry is chosen
         self.latest_ns = 0
         self.fault = ""
         self.delta: MeshDelta | None = None  # of the latest frame
@@ -69,27 +70,27 @@ class StreamMapping:
         frame = self.assembler.take(sent)
         if frame is None:
             return False
-        self.before(frame.index)
         self.latest_ns = frame.stamp_ns
-        if frame.index in self.skip:
-            self._drop("frames_that_end_the_process")
-            return True
-        try:
-            self._map(frame)
-        except InputError as error:
-            self.fault = self.fault or str(error)
-            self._drop("frames_skipped")
+        for ready in self._ready(frame):
+            self._one(ready)
         return True
 
     def save(self, out: Path) -> dict[str, Any]:
         """Finish the map and write all results to ``out``; returns what report.json holds. Raises RunError."""
         prepare(out)
+        if self._first is not None:  # the stream was too short to choose
+            for frame in self._begin():
+                self._one(frame)
+        if not self.mapper.trajectory:
+            raise RunError("no frame of a LiDAR could be mapped; what was recorded is kept")
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
         self.mapper.finish()
         self.statistics.flush_ms = (time.perf_counter_ns() - wall) / _NS_PER_MS
         self.statistics.flush_cpu_ms = (time.process_time_ns() - cpu) / _NS_PER_MS
         self.statistics.add_lost(self.assembler.lost)
         self.statistics.add_lost(self.mapper.lost)
+        found = self.odometry.lost.items()
+        self.statistics.add_lost({f"odometry_{reason.replace(' ', '_')}": n for reason, n in found})
         results = Results(out)
         photos = HeldOut(out, 0)
         report = write_results(
@@ -102,6 +103,30 @@ class StreamMapping:
         poses = self.mapper.trajectory
         stamps = np.array([stamp for stamp, _ in poses], np.int64)
         return Trajectory(stamps, np.array([T for _, T in poses], np.float64).reshape(-1, 4, 4))
+
+    def _ready(self, frame: SyncedFrame) -> list[SyncedFrame]:
+        """Frames that can be mapped now: the first ones wait for each other."""
+        if self._first is None:
+            return [frame]
+        self._first.append(frame)
+        return self._begin() if len(self._first) == LOOKED_AT else []
+
+    def _begin(self) -> list[SyncedFrame]:
+        """Choose the odometry by the first frames; returns them."""
+        first, self._first = self._first or [], None
+        self.odometry.choose(first)
+        return first
+
+    def _one(self, frame: SyncedFrame) -> None:
+        self.before(frame.index)
+        if frame.index in self.skip:
+            self._drop("frames_that_end_the_process")
+            return
+        try:
+            self._map(frame)
+        except InputError as error:
+            self.fault = self.fault or str(error)
+            self._drop("frames_skipped")
 
     def _map(self, frame: SyncedFrame) -> None:
         frame = self._prepare(frame)
