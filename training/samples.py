@@ -19,9 +19,16 @@ CROP = (256, 192)
 _SCALE = (0.5, 1.0)  # of the views, whose crops these are
 _SOUGHT_SCALE = (0.6, 1.6)  # of crops that look for a class
 _ASIDE = 60  # pixels of the view that such a crop's middle is beside a pixel of the class at most
-#: How often crops look for a class, relative to each other (1 where not named).
-_SOUGHT = {"person": 3.0, "bench": 3.0, "backpack": 3.0, "car": 2.0, "tree": 2.0, "hedge": 1.5, "ground": 0.3}
-_SOUGHT |= {"building": 0.5, "background": 0.3}
+#: How often crops look for a class, relative to each other (0.5 where not named).
+_SOUGHT = {
+    "person": 6.0,
+    "bench": 6.0,
+    "backpack": 4.0,
+    "car": 3.0,
+    "tree": 3.0,
+    "hedge": 1.0,
+    "bicycle": 1.0,
+}
 _LEAST_PIXELS = 40  # of a class in a view that is chosen for it
 _TURN_DEG = 5.0
 
@@ -81,7 +88,7 @@ def _anywhere(views: Views, rng: Rng, view: int) -> tuple[U8, U8]:
 def _looking(views: Views, rng: Rng) -> tuple[U8, U8]:
     """A crop around a pixel of a class."""
     there = [k for k, found in enumerate(views.with_class) if len(found)]
-    weight = np.array([_SOUGHT.get(NETWORK_CLASSES[k], 1.0) for k in there])
+    weight = np.array([_SOUGHT.get(NETWORK_CLASSES[k], 0.5) for k in there])
     wanted = there[int(rng.choice(len(there), p=weight / weight.sum()))]
     view = int(rng.choice(views.with_class[wanted]))
     row, column = np.divmod(

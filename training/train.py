@@ -1,7 +1,7 @@
 """Trains the network on rendered views and writes its weights.
 
     python training/train.py --views VIEWS --check OTHER_VIEWS --out WEIGHTS.pt [--steps N] [--seed N]
-        [--start WEIGHTS.pt] [--sought SHARE]
+        [--start WEIGHTS.pt] [--sought SHARE] [--rate RATE]
 
 One thread; equal arguments and views, equal weights on equal machines. The weights so far are written now and
 then, so that a long training can be looked at.
@@ -58,6 +58,7 @@ class Plan:
     steps: int
     seed: int
     sought: float
+    rate: float
     start: Path | None
 
 
@@ -73,9 +74,9 @@ def train(views: Views, how: Plan, out: Path) -> Network:
     mean = torch.optim.swa_utils.AveragedModel(
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(_AVERAGED), use_buffers=True
     )
-    optimiser = torch.optim.AdamW(_groups(network), lr=_RATE)
+    optimiser = torch.optim.AdamW(_groups(network), lr=how.rate)
     plan = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, _RATE, total_steps=steps, pct_start=_WARM_UP, cycle_momentum=False
+        optimiser, how.rate, total_steps=steps, pct_start=_WARM_UP, cycle_momentum=False
     )
     order, began, total = epochs(len(views), rng), time.process_time(), 0.0
     network.train()
@@ -133,13 +134,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=2400)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--start", type=Path, help="weights to go on from")
+    parser.add_argument("--rate", type=float, default=_RATE, help="learning rate at its highest")
     parser.add_argument("--sought", type=float, default=0.7, help="share of crops that look for a class")
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)
     views = Views(list(given.views.glob("*.npz")))
     print(f"{len(views)} views", flush=True)
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    network = train(views, Plan(given.steps, given.seed, given.sought, given.start), given.out)
+    network = train(views, Plan(given.steps, given.seed, given.sought, given.rate, given.start), given.out)
     for world in sorted({p.name.split("-")[0] for p in given.check.glob("*.npz")}):
         table = confusion(network, Views(list(given.check.glob(f"{world}-*.npz"))))
         there = table.sum(axis=1) > 0
