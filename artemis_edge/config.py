@@ -92,6 +92,9 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     accel_walk: Annotated[
         float, _float("Random walk of the accelerometer's bias, m/s3/sqrt(Hz).", ge=1e-8, le=10.0)
     ] = 3e-4
+    visual: Annotated[
+        bool, Meta(description="Whether images correct the filter, where the rig has cameras and an IMU.")
+    ] = True
 
 
 class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):

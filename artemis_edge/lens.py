@@ -24,7 +24,7 @@ def distort(x: float, y: float, distortion: F64) -> tuple[float, float]:
 
 
 @njit
-def _slope(x: float, y: float, distortion: F64) -> tuple[float, float, float]:
+def slope(x: float, y: float, distortion: F64) -> tuple[float, float, float]:
     """Derivatives of :func:`distort`: of x by x, of x by y (and of y by x, the same), of y by y."""
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
@@ -46,7 +46,7 @@ def _undistort(u: float, v: float, distortion: F64, fold: float) -> tuple[float,
         error_u, error_v = at_u - u, at_v - v
         if abs(error_u) < _TOLERANCE and abs(error_v) < _TOLERANCE:
             return (x, y) if x * x + y * y < fold * fold else (np.nan, np.nan)
-        a, b, d = _slope(x, y, distortion)
+        a, b, d = slope(x, y, distortion)
         det = a * d - b * b
         x -= (d * error_u - b * error_v) / det
         y -= (a * error_v - b * error_u) / det

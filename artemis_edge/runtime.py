@@ -13,7 +13,7 @@ import msgspec
 
 from artemis_edge import health
 from artemis_edge.compile_ahead import compile_ahead
-from artemis_edge.config import Config, to_toml
+from artemis_edge.config import Config, OdometryConfig, to_toml
 from artemis_edge.datasets import lidar_poses, open_input
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.export.atlas import read_atlas
@@ -26,6 +26,8 @@ from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, readable, warm_up
 from artemis_edge.odometry.choice import OwnOdometry, odometry_for
 from artemis_edge.odometry.given_poses import GivenPoses
+from artemis_edge.odometry.inertial_odometry import InertialOdometry
+from artemis_edge.odometry.visual import VisualUpdate
 from artemis_edge.progress import Report, silent
 from artemis_edge.questions import BlankMasks, Questions, ScheduledMasks, every_image, unanswered
 from artemis_edge.semantic_map import Segmenter
@@ -211,7 +213,12 @@ def choose_odometry(source: FrameSource, request: Request, span: range) -> Calla
     if source.poses is not None and len(source.poses) and not request.own_odometry:
         own = GivenPoses(source.poses)
         return lambda: own
-    return lambda: odometry_for(request.config.odometry, lambda: _frames(source, span))
+    return lambda: own_odometry(request.config.odometry, lambda: _frames(source, span))
+
+
+def own_odometry(config: OdometryConfig, frames: Callable[[], Iterator[SyncedFrame]]) -> OwnOdometry:
+    """The odometry of a recording, with its images unless the configuration says no."""
+    return odometry_for(config, frames, VisualUpdate() if config.visual else None)
 
 
 def _frames(source: FrameSource, span: range) -> Iterator[SyncedFrame]:
@@ -258,9 +265,8 @@ def count_losses(statistics: RunStatistics, source: FrameSource, odometry: Odome
     statistics.add_lost(source.lost)
     statistics.add_lost(mapper.lost)
     if isinstance(odometry, OwnOdometry):
-        statistics.add_lost(
-            {f"odometry_{reason.replace(' ', '_')}": n for reason, n in odometry.lost.items()}
-        )
+        losses = odometry.losses if isinstance(odometry, InertialOdometry) else odometry.lost
+        statistics.add_lost({f"odometry_{reason.replace(' ', '_')}": n for reason, n in losses.items()})
     statistics.frames_dropped += source.lost.get("empty_file", 0)
 
 

@@ -106,6 +106,11 @@ class InertialOdometry:
         """The filter's state after the last frame."""
         return self._state
 
+    @property
+    def losses(self) -> dict[str, int]:
+        """``lost``, and what the visual update could not use."""
+        return self.lost | (self._images.lost if self._images is not None else {})
+
     def track(self, frame: SyncedFrame) -> TrackedFrame:
         """Pose of the frame, its points moved to its stamp; a frame without scans is propagated."""
         self._imu = inertial.join(self._imu, frame.imu)
