@@ -27,6 +27,7 @@ from artemis_edge.refinement.semantics import labels_of, refine_rows
 from artemis_edge.segmentation.backend import Segmentation
 from artemis_edge.segmentation.keyframes import Keyframe, read_keyframes, segment_all
 from artemis_edge.segmentation.registry import open_by_name
+from artemis_edge.segmentation.yolo_seg import Thresholds
 from artemis_edge.semantic_map import BACKGROUND, active_slots, reliability, slot_layers, spread_labels
 from artemis_edge.sight import compare_depth, new_seen, new_sight, see_rows, splat_depth
 from artemis_edge.voxel_fusion import grid_of, sample_scores
@@ -47,10 +48,10 @@ def ask(
     if folder is None:
         raise InputError(f"{map_path} has no folder map/ beside its mesh; give the output directory of a run")
     config = _config(folder)
-    questions = Questions.of(texts, model or config.segmentation.model)
+    questions = Questions.of(texts, model or config.segmentation.model, Thresholds.by(config.segmentation))
     if not questions.names:
         return unanswered(questions, "nothing in it can be looked for")
-    backend = open_by_name(questions.model)
+    backend = open_by_name(questions.model, questions.thresholds)
     brush = MeshBrush(mesh, questions.names, config.semantics, config.voxel_map.voxel_m / 4)
     for keyframe, seen in segment_all(read_keyframes(folder), backend, questions.prompts, report):
         brush.refine(keyframe, seen)

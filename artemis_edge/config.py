@@ -235,7 +235,7 @@ class SemanticsConfig(Struct, frozen=True, forbid_unknown_fields=True):
         float,
         _float("Weight of E_semantic in eq. 2; 0 leaves edges between objects alone.", ge=0.0, le=100.0),
     ] = 1.0
-    lambda_smooth: Annotated[float, _float("Weight of E_smoothness in eq. 2.", ge=0.0, le=100.0)] = 0.5
+    lambda_smooth: Annotated[float, _float("Weight of E_smoothness in eq. 2.", ge=0.0, le=100.0)] = 0.1
     temperature: Annotated[float, _float("tau of eq. 5.", ge=0.0, le=100.0)] = 4.0
     sweeps: Annotated[int, Meta(description="Gauss-Seidel sweeps of the constraint.", ge=1, le=20)] = 3
     refinement: Annotated[

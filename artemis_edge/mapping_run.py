@@ -6,7 +6,7 @@ import gc
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -43,6 +43,11 @@ class Mapper(Protocol):
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
         """All stages for one frame."""
+        ...
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Sentences for the user about what the stages could not use."""
         ...
 
     @property

@@ -138,6 +138,11 @@ class Pipeline:
                 self.segmenter.offer(image, self.semantics.sight(image, T_world_lidar))
 
     @property
+    def warnings(self) -> list[str]:
+        """The first of each kind of photograph that could not be used."""
+        return list(self.refinement.refused.sentences.values())
+
+    @property
     def lost(self) -> dict[str, int]:
         """What the stages could not take, by reason; empty when nothing was lost."""
         counts = {

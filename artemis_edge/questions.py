@@ -17,6 +17,7 @@ from artemis_edge.segmentation.engine import HereEngine, ProcessEngine
 from artemis_edge.segmentation.registry import Registry, open_by_name
 from artemis_edge.segmentation.resolve import SlotTable, Understanding, understand
 from artemis_edge.segmentation.worker import Schedule, Scheduled
+from artemis_edge.segmentation.yolo_seg import Thresholds
 from artemis_edge.semantic_map import LateMask
 from artemis_edge.sight import Sight
 
@@ -28,9 +29,10 @@ class Questions:
     model: str
     asked: tuple[Understanding, ...]
     names: tuple[str, ...]
+    thresholds: Thresholds | None = None
 
     @classmethod
-    def of(cls, texts: Sequence[str], model: str = "") -> Questions:
+    def of(cls, texts: Sequence[str], model: str = "", thresholds: Thresholds | None = None) -> Questions:
         """Understand questions with a model of the registry; raises InputError where it cannot be used or the
         questions need more classes than there are slots."""
         backend = Registry().find(model).open()
@@ -38,7 +40,7 @@ class Questions:
         slots = SlotTable()
         for question in asked:
             slots.acquire(question.classes)
-        return cls(backend.name, asked, tuple(slots.names().values()))
+        return cls(backend.name, asked, tuple(slots.names().values()), thresholds)
 
     @property
     def prompts(self) -> tuple[Prompt, ...]:
@@ -49,10 +51,10 @@ class Questions:
         """The network at work on a fixed schedule, so that equal input gives equal maps; ``beside`` the pipeline in
         a process of its own, or here."""
         if beside:
-            engine = ProcessEngine(partial(open_by_name, self.model))
+            engine = ProcessEngine(partial(open_by_name, self.model, self.thresholds))
             engine.wait_until_ready()
             return ScheduledMasks(self.names, Scheduled(engine, self.prompts, schedule))
-        here = HereEngine(open_by_name(self.model))
+        here = HereEngine(open_by_name(self.model, self.thresholds))
         return ScheduledMasks(self.names, Scheduled(here, self.prompts, schedule))
 
     def replies(self, mesh: Mesh, probability: F32) -> list[Reply]:

@@ -30,6 +30,7 @@ from artemis_edge.odometry.inertial_odometry import InertialOdometry
 from artemis_edge.odometry.visual import VisualUpdate
 from artemis_edge.progress import Report, silent
 from artemis_edge.questions import BlankMasks, Questions, ScheduledMasks, every_image, unanswered
+from artemis_edge.segmentation.yolo_seg import Thresholds
 from artemis_edge.semantic_map import Segmenter
 from artemis_edge.session.photos import INDEX, HeldOut
 from artemis_edge.session.report import Evaluation, RunStatistics, write_report
@@ -131,7 +132,7 @@ def reprocess(
     _complain(run, results, request.out)
     if outcome is not None and not outcome["triangles"]:
         raise _nothing_meshed(outcome, request, results)
-    warnings = [*source.warnings, *_skipped(run, statistics), *answering.warnings]
+    warnings = [*source.warnings, *_skipped(run, statistics), *mapper.warnings, *answering.warnings]
     return Outcome(request.out, outcome or {}, statistics, run.trajectory(), warnings)
 
 
@@ -142,7 +143,8 @@ class Answering:
         self.warnings: list[str] = []
         self._request = request
         model = request.model or request.config.segmentation.model
-        self.questions = Questions.of(request.queries, model) if request.queries else None
+        thresholds = Thresholds.by(request.config.segmentation)
+        self.questions = Questions.of(request.queries, model, thresholds) if request.queries else None
         self._masks: ScheduledMasks | None = None
 
     def __enter__(self) -> Answering:

@@ -1,7 +1,7 @@
 """What several test files share: a small mapper in place of the pipeline, and small inputs."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -57,6 +57,10 @@ class FakeMapper:
         mesh = bare_mesh(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
         write_ply(path, mesh)
         return mesh
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        return ()
 
     @property
     def probability(self) -> F32:
