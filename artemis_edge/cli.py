@@ -11,7 +11,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from artemis_edge.commands import models, output, replay, rig, run, semantics, session, texture, tui, view
+from artemis_edge.commands import (
+    calibrate,
+    models,
+    output,
+    replay,
+    rig,
+    run,
+    semantics,
+    session,
+    texture,
+    tui,
+    view,
+)
 from artemis_edge.errors import InputError, UserError
 
 Handler = Callable[[argparse.Namespace], int]
@@ -106,6 +118,7 @@ def _parser() -> argparse.ArgumentParser:
         run.add,
         models.add,
         rig.add,
+        calibrate.add,
         tui.add,
     ):
         add(commands)

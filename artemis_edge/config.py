@@ -271,6 +271,10 @@ class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
         str,
         Meta(description="Odometry topic whose poses are used where tf has none; empty: the first by name."),
     ] = ""
+    calibration: Annotated[
+        str,
+        Meta(description="File of calibrate: mounts, lenses and time offsets instead of the recording's own."),
+    ] = ""
 
 
 class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):

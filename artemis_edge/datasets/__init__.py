@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from artemis_edge.calibrate.mounts import CalibratedSource, Mounts
 from artemis_edge.config import InputConfig
 from artemis_edge.datasets.kitti import open_odometry, open_raw
 from artemis_edge.datasets.rosbag import RosbagSource, bag_files
+from artemis_edge.devices.calibration import read_calibration
 from artemis_edge.errors import InputError
 from artemis_edge.frames import FrameSource, Trajectory
 
@@ -22,11 +24,16 @@ def open_input(path: Path, config: InputConfig | None = None) -> FrameSource:
     opener = _opener(path)
     if opener is None:
         raise InputError(_unknown(path))
-    return RosbagSource(path, config) if opener is RosbagSource else opener(path)
+    source = RosbagSource(path, config) if opener is RosbagSource else opener(path)
+    if config is None or not config.calibration:
+        return source
+    calibration = read_calibration(Path(config.calibration))
+    return CalibratedSource(source, Mounts.of(calibration, source))
 
 
 def lidar_poses(source: FrameSource, given: Trajectory) -> Trajectory:
     """Given poses as those of the primary LiDAR: see ``RosbagSource.lidar_poses``."""
+    source = source.source if isinstance(source, CalibratedSource) else source
     return source.lidar_poses(given) if isinstance(source, RosbagSource) else given
 
 

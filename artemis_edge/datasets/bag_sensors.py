@@ -127,6 +127,15 @@ def find_imu(index: BagIndex, config: InputConfig, lidar_frame: str) -> ImuSampl
     return ImuSamples(stamps, gyro, accel, T_lidar_imu[:3, 3])
 
 
+def imu_mounting(index: BagIndex, config: InputConfig, lidar_frame: str) -> F64:
+    """T_lidar_imu (4, 4) of the IMU that :func:`find_imu` takes; identity where tf does not say."""
+    topic = config.imu_topic or min(index.imus, default="")
+    if topic not in index.imus:
+        return np.eye(4)
+    T, known = _mounting(index, lidar_frame, index.imus[topic].frame_id, np.zeros(1, np.int64))
+    return np.array(T[0]) if known.all() else np.eye(4)
+
+
 def find_odometry(index: BagIndex, config: InputConfig) -> OdometryTrack | None:
     """The chosen Odometry topic."""
     topic = _first(index, index.odometries, config.odometry_topic, "odometry_topic")

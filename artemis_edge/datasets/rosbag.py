@@ -24,6 +24,7 @@ from artemis_edge.datasets.bag_sensors import (
     find_imu,
     find_lidars,
     find_odometry,
+    imu_mounting,
 )
 from artemis_edge.datasets.clouds import CloudFormat
 from artemis_edge.datasets.common import (
@@ -66,7 +67,8 @@ class RosbagSource:
 
     ``poses`` are those of tf, else of an Odometry topic, at the stamps of the frames that they cover, else
     None; the world is the root of the tree above the primary LiDAR. ``stamp_ns`` (n,) are the stamps of all
-    frames. A frame may hold images without scans. IMU samples are in the axes of the primary LiDAR.
+    frames. A frame may hold images without scans. IMU samples are in the axes of the primary LiDAR;
+    ``T_lidar_imu`` is how the recording says that the IMU is mounted.
     """
 
     def __init__(self, path: Path, config: InputConfig | None = None) -> None:
@@ -81,6 +83,7 @@ class RosbagSource:
         self._plans = _attach_images(plans, self._cameras, timing)
         self.stamp_ns: I64 = np.array([plan.stamp_ns for plan in self._plans], np.int64)
         self._imu = find_imu(index, config, lidar_frame)
+        self.T_lidar_imu: F64 = imu_mounting(index, config, lidar_frame)
         starts = self.stamp_ns + round(timing.start_s * SECOND_NS)
         self._imu_bounds = split_imu(self._imu.stamp_ns, starts)
         self.poses: Trajectory | None = _poses(index, config, lidar_frame, self.stamp_ns)

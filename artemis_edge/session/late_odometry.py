@@ -5,6 +5,7 @@ from __future__ import annotations
 from artemis_edge.config import OdometryConfig
 from artemis_edge.frames import SyncedFrame, TrackedFrame
 from artemis_edge.odometry.choice import OwnOdometry, odometry_for
+from artemis_edge.odometry.visual import VisualUpdate
 
 LOOKED_AT = 2  # frames, as odometry_for looks at
 
@@ -23,7 +24,8 @@ class LateOdometry:
 
     def choose(self, frames: list[SyncedFrame]) -> None:
         """Settle for what the first frames of the stream allow."""
-        self._chosen = odometry_for(self._config, lambda: iter(frames))
+        images = VisualUpdate() if self._config.visual else None
+        self._chosen = odometry_for(self._config, lambda: iter(frames), images)
 
     def track(self, frame: SyncedFrame) -> TrackedFrame:
         """As Odometry."""
