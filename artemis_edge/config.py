@@ -273,7 +273,9 @@ class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = ""
     calibration: Annotated[
         str,
-        Meta(description="File of calibrate: mounts, lenses and time offsets instead of the recording's own."),
+        Meta(
+            description="File of calibrate: mounts, lenses and time offsets instead of the recording's own."
+        ),
     ] = ""
 
 
