@@ -24,6 +24,7 @@ from artemis_edge.frames import MeshDelta, Odometry, SyncedFrame
 from artemis_edge.newest import Newest
 from artemis_edge.pipeline import Pipeline
 from artemis_edge.progress import Report
+from artemis_edge.questions import BlankMasks
 from artemis_edge.semantic_map import Segmenter
 from artemis_edge.status import MapStatus, Status, Stream
 from artemis_edge.tui.live_questions import EVERY_CLASS, LiveQuestions
@@ -249,7 +250,7 @@ class _Make:
             self._teller.say(
                 message="getting ready; the very first time takes a minute or two", frames_total=0
             )
-            return Pipeline(config, odometry, folder, segmenter)
+            return Pipeline(config, odometry, folder, BlankMasks(("anything",)))
         return WatchedPipeline(config, odometry, folder, self._teller, segmenter)
 
 
