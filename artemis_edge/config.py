@@ -95,6 +95,12 @@ class OdometryConfig(Struct, frozen=True, forbid_unknown_fields=True):
     visual: Annotated[
         bool, Meta(description="Whether images correct the filter, where the rig has cameras and an IMU.")
     ] = True
+    close_loops: Annotated[
+        bool,
+        Meta(
+            description="Whether reprocess looks for places seen again and corrects the poses (extra loop)."
+        ),
+    ] = False
 
 
 class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):

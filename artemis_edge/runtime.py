@@ -116,6 +116,8 @@ def reprocess(
         with Interrupt() as interrupt, telling(request.config.view) as live:
             warm_up_run(request, odometry, pages, source, span, statistics, make)
             tracker = odometry()
+            if request.config.odometry.close_loops and isinstance(tracker, OwnOdometry):
+                tracker = corrected(tracker, odometry, source, span)
             photos = HeldOut(request.out, request.holdout)
             mapper = answering.mapper(make, photos.watching(tracker), pages)
             run = MappingRun(mapper, source, span, statistics, live.watching(mapper))
@@ -223,6 +225,17 @@ def own_odometry(config: OdometryConfig, frames: Callable[[], Iterator[SyncedFra
     return odometry_for(config, frames, VisualUpdate() if config.visual else None)
 
 
+def corrected(
+    tracker: Odometry, odometry: Callable[[], Odometry], source: FrameSource, span: range
+) -> Odometry:
+    """The odometry with the loops of the recording closed, for which it runs once beforehand."""
+    from artemis_edge.loop.corrected import CorrectedOdometry, close_loops
+
+    closed = close_loops(odometry, _frames(source, span))
+    source.warnings.append(closed.sentence())
+    return CorrectedOdometry(tracker, closed.correction) if closed.loops else tracker
+
+
 def _frames(source: FrameSource, span: range) -> Iterator[SyncedFrame]:
     return (frame for frame, _ in readable(source, span) if frame is not None)
 
@@ -266,6 +279,7 @@ def count_losses(statistics: RunStatistics, source: FrameSource, odometry: Odome
     """What the input could not give and what the stages could not use."""
     statistics.add_lost(source.lost)
     statistics.add_lost(mapper.lost)
+    odometry = getattr(odometry, "inner", odometry)
     if isinstance(odometry, OwnOdometry):
         losses = odometry.losses if isinstance(odometry, InertialOdometry) else odometry.lost
         statistics.add_lost({f"odometry_{reason.replace(' ', '_')}": n for reason, n in losses.items()})
