@@ -30,7 +30,7 @@ Handler = Callable[[argparse.Namespace], int]
 
 DONE, FELL_SHORT, BAD_USE = 0, 1, 2
 DEMO_OUT = Path("demo-out")
-_DEMO_SECONDS, _SIMULATED_SECONDS, _SEED = 20.0, 20.0, 1
+_DEMO_SECONDS, _SIMULATED_SECONDS, _SEED = 12.0, 20.0, 1
 
 
 class _Parser(argparse.ArgumentParser):
@@ -153,7 +153,7 @@ def _demo(commands: Any) -> None:
     parser = _command(commands, "demo", run_demo, "walk through a virtual world, map it, measure the map")
     parser.add_argument("--world", default="street", metavar="NAME", help="as of simulate (default: street)")
     parser.add_argument(
-        "--seconds", type=float, default=_DEMO_SECONDS, help="length of the walk (default: 20)"
+        "--seconds", type=float, default=_DEMO_SECONDS, help="length of the walk (default: 12)"
     )
     parser.add_argument("--out", type=Path, default=DEMO_OUT, metavar="DIR", help="default: ./demo-out")
     parser.add_argument(
