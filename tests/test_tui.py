@@ -1,6 +1,7 @@
 """The terminal: pages by pilot, pictures by hand, and a whole session against a remote that is told what to say."""
 
 import asyncio
+import multiprocessing
 import threading
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from artemis_edge.frames import MeshDelta
 from artemis_edge.newest import Newest, joined
 from artemis_edge.status import MapStatus, QueryStatus, Status, Stream, SyncStatus
 from artemis_edge.tui.app import ArtemisTui, LivePage
+from artemis_edge.tui.child import Teller
 from artemis_edge.tui.history import History
 from artemis_edge.tui.live_questions import LiveQuestions
 from artemis_edge.tui.pages import recordings
@@ -447,3 +449,31 @@ def test_live_questions_choose_among_what_is_looked_for() -> None:
     assert len({q.colour for q in live.told()}) == 3
     live.order("forget", "unicorn")
     assert [q.text for q in live.told()] == ["trees", "person"]
+
+
+def test_the_demos_child_tells_and_hears() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    left = threading.Event()
+    teller = Teller(theirs, left.set)
+    teller.live = LiveQuestions(["car"])
+    teller.say(state="replaying", frames=3)
+    teller.frame(delta((0, 0, 0), np.zeros((4, 3))), 20.0)
+    ours.send(("ask", "car"))
+    status, news = None, []
+    for _ in range(50):
+        status, found = ours.recv()
+        news += [] if found is None else [found]
+        if status.queries and news:
+            break
+    assert status is not None and status.frames == 3 and status.frame_ms == [20.0]
+    assert [q.labels for q in status.queries] == [[1]] and len(news[0].position) == 4
+    teller.say(state="done")
+    teller.close()
+    while ours.poll(1.0):
+        status, _ = ours.recv()
+        if status.state == "done":
+            break
+    assert status.state == "done"
+    ours.close()
+    assert left.wait(5.0), "without a terminal the demo ends"
+    theirs.close()

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -115,12 +115,14 @@ class DemoRemote:
 class Teller:
     """In the child: keeps the newest state and sends it from a thread, so that the pipeline never waits."""
 
-    def __init__(self, pipe: Connection) -> None:
-        self._pipe = pipe
+    def __init__(self, pipe: Connection, leave: Callable[[], None] = lambda: _signal(signal.SIGTERM)) -> None:
+        """``leave`` is called when the terminal has gone."""
+        self._pipe, self._leave = pipe, leave
         self._newest = Newest()
         self._status = Status(state="checking", message="starting")
         self._times: deque[float] = deque(maxlen=_RECENT)
         self.orders: deque[tuple[str, str]] = deque()
+        self.live: LiveQuestions | None = None
         self.stop = threading.Event()
         self._closing = threading.Event()
         self._start = time.monotonic()
@@ -150,7 +152,15 @@ class Teller:
         while True:
             last = self._closing.wait(_SEND_EVERY_S)
             delta = self._newest.take(_MOST_BLOCKS)
-            status = replace(self._status, frame_ms=list(self._times), seconds=time.monotonic() - self._start)
+            while self.live is not None and self.orders:  # also when the walk is over
+                self.live.order(*self.orders.popleft())
+            queries = [] if self.live is None else self.live.told()
+            status = replace(
+                self._status,
+                frame_ms=list(self._times),
+                queries=queries,
+                seconds=time.monotonic() - self._start,
+            )
             try:
                 self._pipe.send((status, delta))
             except OSError:
@@ -165,13 +175,17 @@ class Teller:
             except (EOFError, OSError):
                 what, text = "quit", ""
             if what == "quit":
-                os.kill(os.getpid(), signal.SIGTERM)
+                self._leave()
                 return
             if what == "stop":
                 self.stop.set()
-                os.kill(os.getpid(), signal.SIGINT)  # the run ends after this frame and keeps what it has
+                _signal(signal.SIGINT)  # the run ends after this frame and keeps what it has
             else:
                 self.orders.append((what, text))
+
+
+def _signal(number: int) -> None:
+    os.kill(os.getpid(), number)
 
 
 class WatchedPipeline(Pipeline):
@@ -186,7 +200,7 @@ class WatchedPipeline(Pipeline):
         segmenter: Segmenter | None,
     ) -> None:
         super().__init__(config, odometry, folder, segmenter)
-        self._live = LiveQuestions([] if segmenter is None else list(segmenter.names))
+        teller.live = LiveQuestions([] if segmenter is None else list(segmenter.names))
         self._teller = teller
         self._due = 0.0
         self._frames = 0
@@ -212,8 +226,6 @@ class WatchedPipeline(Pipeline):
         return delta
 
     def _tell(self, frame: SyncedFrame) -> None:
-        while self._teller.orders:
-            self._live.order(*self._teller.orders.popleft())
         T = self.trajectory[-1][1]
         points = sum(len(scan.points) for scan in frame.scans)
         counter = self.voxel_map.store.counter
@@ -226,7 +238,6 @@ class WatchedPipeline(Pipeline):
             state="replaying",
             frames=self._frames,
             streams=streams,
-            queries=self._live.told(),
             position=tuple(float(v) for v in T[:3, 3]),
             yaw=float(np.arctan2(T[1, 0], T[0, 0])),
             map=MapStatus(

@@ -144,7 +144,7 @@ class Queries(DataTable[Text]):
                 Text("██", style=f"rgb({q.colour[0]},{q.colour[1]},{q.colour[2]})"),
                 Text(q.text[:40]),
                 Text(str(q.count), style="bold" if found else "dim"),
-                Text(f"{q.score:.2f}" if found else "-"),
+                Text(f"{q.score:.2f}" if q.score > 0.0 else "-"),
                 Text(q.status + (f": {q.note}" if q.note else ""), style="green" if found else "dim"),
                 key=q.text,
             )
