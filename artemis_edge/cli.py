@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import errno
-import json
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -24,11 +23,9 @@ from artemis_edge.commands import (
     tui,
     view,
 )
+from artemis_edge.commands.common import BAD_USE, DONE, FELL_SHORT, Handler, command, json_option, print_json
 from artemis_edge.errors import InputError, UserError
 
-Handler = Callable[[argparse.Namespace], int]
-
-DONE, FELL_SHORT, BAD_USE = 0, 1, 2
 DEMO_OUT = Path("demo-out")
 _DEMO_SECONDS, _SIMULATED_SECONDS, _SEED = 12.0, 20.0, 1
 
@@ -87,10 +84,6 @@ def _os_sentence(error: OSError) -> str:
     return f"{what}{error.strerror or error}; check that it is there and that you may use it"
 
 
-def _print_json(value: Any) -> None:
-    print(json.dumps(value, ensure_ascii=False, allow_nan=False))
-
-
 # --- the grammar
 
 
@@ -131,16 +124,6 @@ def _version() -> str:
     return f"artemis-edge {metadata.version('artemis-edge')}"
 
 
-def _command(commands: Any, name: str, handler: Handler, text: str) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
-    parser.set_defaults(handler=handler)
-    return parser
-
-
-def _json_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
-
-
 def _config_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", metavar="NAME", help="a set of settings that ships with the program")
     parser.add_argument(
@@ -150,7 +133,7 @@ def _config_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _demo(commands: Any) -> None:
-    parser = _command(commands, "demo", run_demo, "walk through a virtual world, map it, measure the map")
+    parser = command(commands, "demo", run_demo, "walk through a virtual world, map it, measure the map")
     parser.add_argument("--world", default="street", metavar="NAME", help="as of simulate (default: street)")
     parser.add_argument(
         "--seconds", type=float, default=_DEMO_SECONDS, help="length of the walk (default: 12)"
@@ -168,7 +151,7 @@ def _demo(commands: Any) -> None:
 
 
 def _simulate(commands: Any) -> None:
-    parser = _command(
+    parser = command(
         commands, "simulate", run_simulate, "record a session in a virtual world, with its truth"
     )
     parser.add_argument(
@@ -187,7 +170,7 @@ def _simulate(commands: Any) -> None:
 
 
 def _reprocess(commands: Any) -> None:
-    parser = _command(
+    parser = command(
         commands, "reprocess", run_reprocess, "map recordings: from an input to a mesh and report"
     )
     parser.add_argument(
@@ -223,41 +206,41 @@ def _reprocess(commands: Any) -> None:
     parser.add_argument(
         "--model", default="", metavar="NAME", help="network that looks for it ('models list')"
     )
-    _json_option(parser)
+    json_option(parser)
 
 
 def _evaluate(commands: Any) -> None:
     group = commands.add_parser("evaluate", help="measure a mesh or a trajectory against a reference")
     kinds = group.add_subparsers(title="kinds", metavar="KIND", required=True)
-    mesh = _command(kinds, "mesh", run_evaluate_mesh, "a mesh against a reference cloud")
+    mesh = command(kinds, "mesh", run_evaluate_mesh, "a mesh against a reference cloud")
     mesh.add_argument("mesh", type=Path, metavar="MESH", help="an output directory or a mesh.ply")
     mesh.add_argument("--reference", type=Path, required=True, metavar="CLOUD.ply")
     mesh.add_argument("--threshold", type=float, action="append", metavar="METRES", help="default: 0.1")
     mesh.add_argument("--crop", action="store_true", help="leave out the mesh outside the reference's box")
     mesh.add_argument("--heatmap", type=Path, metavar="FILE.png", help="precision and recall from above")
-    _json_option(mesh)
+    json_option(mesh)
     texture.add(kinds)
     semantics.add_evaluate(kinds)
-    path = _command(kinds, "trajectory", run_evaluate_trajectory, "a trajectory against a reference")
+    path = command(kinds, "trajectory", run_evaluate_trajectory, "a trajectory against a reference")
     path.add_argument("estimate", type=Path, metavar="ESTIMATE.tum")
     path.add_argument("--reference", type=Path, required=True, metavar="REF.tum")
-    _json_option(path)
+    json_option(path)
 
 
 def _bench(commands: Any) -> None:
-    parser = _command(commands, "bench", run_bench, "measure what a frame costs on this machine")
+    parser = command(commands, "bench", run_bench, "measure what a frame costs on this machine")
     parser.add_argument("input", nargs="?", type=Path, metavar="INPUT", help="default: a virtual Avia walk")
     parser.add_argument(
         "--frames", type=int, default=100, metavar="N", help="at most N frames (default: 100)"
     )
     _config_options(parser)
-    _json_option(parser)
+    json_option(parser)
 
 
 def _check(commands: Any) -> None:
-    parser = _command(commands, "check", run_check, "see whether this machine is ready")
+    parser = command(commands, "check", run_check, "see whether this machine is ready")
     parser.add_argument("--config", type=Path, metavar="FILE", help="a configuration to check as well")
-    _json_option(parser)
+    json_option(parser)
 
 
 def _span(text: str) -> tuple[int, int | None]:
@@ -342,7 +325,7 @@ def run_reprocess(given: argparse.Namespace) -> int:
     )
     reports = {str(outcome.out): outcome.report for outcome in outcomes}
     if given.json:
-        _print_json(next(iter(reports.values())) if len(given.inputs) == 1 else {"runs": reports})
+        print_json(next(iter(reports.values())) if len(given.inputs) == 1 else {"runs": reports})
     else:
         for outcome in outcomes:
             print(batch.summary(outcome))
@@ -361,7 +344,7 @@ def run_evaluate_mesh(given: argparse.Namespace) -> int:
 
         write_heat_maps(given.heatmap, result)
     if given.json:
-        _print_json(result.to_json())
+        print_json(result.to_json())
     else:
         print(mesh.to_text(result))
     return DONE
@@ -373,7 +356,7 @@ def run_evaluate_trajectory(given: argparse.Namespace) -> int:
 
     result = trajectory.run(given.estimate, given.reference)
     if given.json:
-        _print_json(result.to_json())
+        print_json(result.to_json())
     else:
         print(trajectory.to_text(result))
     return DONE
@@ -388,7 +371,7 @@ def run_bench(given: argparse.Namespace) -> int:
     settings = config.load(profile=given.profile, sets=given.sets)
     result = bench.bench(given.input, given.frames, settings, plain=given.json)
     if given.json:
-        _print_json(result)
+        print_json(result)
     else:
         print(bench.to_text(result))
     return DONE
@@ -400,7 +383,7 @@ def run_check(given: argparse.Namespace) -> int:
 
     findings = check.check(given.config)
     if given.json:
-        _print_json(check.to_json(findings))
+        print_json(check.to_json(findings))
     else:
         print(check.to_text(findings))
     return DONE if check.ready(findings) else FELL_SHORT

@@ -432,7 +432,7 @@ def load(file: Path | None = None, profile: str | None = None, sets: Iterable[st
     if profile is not None:
         _merge(tree, _read_profile(profile))
     if file is not None:
-        _merge(tree, _read_toml(file))
+        _merge(tree, read_toml(file))
     for text in sets:
         _merge(tree, _parse_set(text))
     try:
@@ -454,6 +454,13 @@ def from_toml(text: str) -> Config:
         raise InputError(f"configuration: {error}; docs/tuning.md lists every field and its range") from None
 
 
+def without_none(value: Any) -> Any:
+    """The same values without those that are none, which TOML cannot say."""
+    if isinstance(value, dict):
+        return {key: without_none(item) for key, item in value.items() if item is not None}
+    return [without_none(item) for item in value] if isinstance(value, list | tuple) else value
+
+
 def profiles() -> list[str]:
     """Names of the profiles that ship with the program."""
     folder = resources.files("artemis_edge") / "profiles"
@@ -466,7 +473,8 @@ def _read_profile(name: str) -> dict[str, Any]:
     return tomllib.loads((resources.files("artemis_edge") / "profiles" / f"{name}.toml").read_text())
 
 
-def _read_toml(file: Path) -> dict[str, Any]:
+def read_toml(file: Path) -> dict[str, Any]:
+    """A file of settings as plain values; InputError where it cannot be read or is no TOML."""
     try:
         return tomllib.loads(file.read_text())
     except OSError as error:

@@ -259,6 +259,12 @@ def warm_up_run(
     gc.collect()
 
 
+def with_tiny_map(config: Config) -> Config:
+    """The configuration with the smallest map there can be, for a warm-up."""
+    small = msgspec.structs.replace(config.voxel_map, memory_budget_mb=_WARM_UP_MB)
+    return msgspec.structs.replace(config, voxel_map=small)
+
+
 def warm_up_here(
     config: Config,
     odometry: Callable[[], Odometry],
@@ -268,8 +274,7 @@ def warm_up_here(
     make: MakeMapper,
 ) -> None:
     """Load every kernel into this process, compiled or not; the map of the warm-up is as small as can be."""
-    small = msgspec.structs.replace(config.voxel_map, memory_budget_mb=_WARM_UP_MB)
-    tiny = msgspec.structs.replace(config, voxel_map=small)
+    tiny = with_tiny_map(config)
     folder = pages / "warm-up"
     folder.mkdir()
     warm_up(lambda: make(tiny, odometry(), folder), source, span, _WARM_UP_FRAMES)

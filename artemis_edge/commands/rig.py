@@ -33,6 +33,7 @@ def run_show(given: argparse.Namespace) -> int:
     import msgspec
     import tomli_w
 
+    from artemis_edge.config import without_none
     from artemis_edge.devices.rig_file import load_rig
 
     rig = load_rig(given.profile)
@@ -44,7 +45,7 @@ def run_show(given: argparse.Namespace) -> int:
     if given.json:
         print_json(tree | {"sha256": rig.digests()})
     else:
-        print(tomli_w.dumps(_without_none(tree)), end="")
+        print(tomli_w.dumps(without_none(tree)), end="")
         print("\n".join(f"# {digest}  {name}" for name, digest in rig.digests().items()))
     return DONE
 
@@ -70,10 +71,3 @@ def run_fast_livo2(given: argparse.Namespace) -> int:
     write_calibration(given.out, from_fast_livo2(given.rig, given.lens))
     print(given.out)
     return DONE
-
-
-def _without_none(value: Any) -> Any:
-    """TOML has no null."""
-    if isinstance(value, dict):
-        return {key: _without_none(v) for key, v in value.items() if v is not None}
-    return [_without_none(v) for v in value] if isinstance(value, list | tuple) else value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +15,7 @@ from artemis_drivers.livox_mid360.settings import Mid360Config
 from artemis_drivers.trigger.settings import TriggerSettings
 from msgspec import Meta, Struct
 
-from artemis_edge.config import Config
+from artemis_edge.config import Config, read_toml, without_none
 from artemis_edge.devices.calibration import Matrix
 from artemis_edge.devices.rig_file import RigFile, load_rig
 from artemis_edge.errors import InputError
@@ -129,7 +128,7 @@ def load(file: Path | str | None) -> RunConfig:
     """
     if file is None:
         return RunConfig()
-    tree = _read(Path(file)) if Path(file).is_file() else {}
+    tree = read_toml(Path(file)) if Path(file).is_file() else {}
     where = str(file)
     if not any(isinstance(entry, dict) for entry in tree.get("lidar", [])):
         return _of_rig(load_rig(file), where)
@@ -180,15 +179,6 @@ def _mount(T_sensor_lidar: Matrix) -> Mount:
     return Mount((x, y, z), (qx, qy, qz, qw))
 
 
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(file.read_text())
-    except OSError as error:
-        raise InputError(f"cannot read configuration {file}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} is not valid TOML: {error}") from None
-
-
 def _convert(tree: dict[str, Any], kind: type[Any], where: str) -> Any:
     try:
         return msgspec.convert(tree, kind)
@@ -198,13 +188,7 @@ def _convert(tree: dict[str, Any], kind: type[Any], where: str) -> Any:
 
 def to_toml(config: RunConfig) -> str:
     """The effective settings."""
-    return tomli_w.dumps(_without_none(msgspec.to_builtins(config)))
-
-
-def _without_none(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_none(item) for key, item in value.items() if item is not None}
-    return [_without_none(item) for item in value] if isinstance(value, list | tuple) else value
+    return tomli_w.dumps(without_none(msgspec.to_builtins(config)))
 
 
 def _require_sense(config: RunConfig, file: str) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import msgspec
 import numpy as np
 
 from artemis_edge import topics
@@ -18,7 +17,7 @@ from artemis_edge.errors import InputError, RunError
 from artemis_edge.frames import MeshDelta, SyncedFrame, Trajectory
 from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Mapper
-from artemis_edge.runtime import MakeMapper, pipeline, write_results
+from artemis_edge.runtime import MakeMapper, pipeline, with_tiny_map, write_results
 from artemis_edge.session.assembly import FrameAssembler
 from artemis_edge.session.late_odometry import LOOKED_AT, LateOdometry
 from artemis_edge.session.message_ring import Sent
@@ -38,7 +37,6 @@ from artemis_edge.session.statistics import RunStatistics
 from artemis_edge.session.writer import cloud_message
 
 _NS_PER_MS = 1e6
-_WARM_UP_MB = 600
 _WARM_UP_FRAMES = 4
 _FRAME_NS = 100_000_000
 _INPUT_HZ = 10.0
@@ -144,9 +142,8 @@ class StreamMapping:
 def warm_up(config: Config, folder: Path, make: MakeMapper = pipeline) -> float:
     """Have every kernel compiled or loaded before the first frame, on a small made-up room; returns the seconds."""
     start = time.perf_counter()
-    small = msgspec.structs.replace(config.voxel_map, memory_budget_mb=_WARM_UP_MB)
     folder.mkdir(parents=True, exist_ok=True)
-    mapping = StreamMapping(msgspec.structs.replace(config, voxel_map=small), folder, make)
+    mapping = StreamMapping(with_tiny_map(config), folder, make)
     for number, (topic, message) in enumerate(_room()):
         mapping.take(Sent(number, topic, message.ROS_TYPE, 0, 0, message.encode()))
     mapping.mapper.finish()
