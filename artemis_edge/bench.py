@@ -55,7 +55,7 @@ def _virtual_walk(folder: Path, frames: int, plain: bool) -> Path:
 
 def _measure(request: Request, plain: bool, make: MakeMapper) -> dict[str, Any]:
     health.restart_peak()
-    source = open_input(request.input, request.config.input)
+    source = open_input(request.input, request.config.input, request.config.exclusion)
     span = frame_span(source, request)
     odometry = choose_odometry(source, request, span)
     statistics = RunStatistics(source.name, source.input_hz)

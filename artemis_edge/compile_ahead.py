@@ -63,7 +63,7 @@ def _compile(request: Request) -> None:
     from artemis_edge.datasets import open_input
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    source = open_input(request.input, request.config.input)
+    source = open_input(request.input, request.config.input, request.config.exclusion)
     span = runtime.frame_span(source, request)
     odometry = runtime.choose_odometry(source, request, span)
     with tempfile.TemporaryDirectory(prefix="artemis-compile-") as name:

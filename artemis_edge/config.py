@@ -285,6 +285,29 @@ class InputConfig(Struct, frozen=True, forbid_unknown_fields=True):
     ] = ""
 
 
+class ExclusionConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """Zones that move with the scanner and belong to the operator, a tripod or the vehicle (exclusion.py).
+
+    In the frame of the primary LiDAR, x ahead, z up, m. Their points are counted as `operator_points` and not used.
+    """
+
+    behind_m: Annotated[
+        float,
+        _float("Points nearer than this behind the scanner are the operator; 0: none [m].", ge=0.0, le=10.0),
+    ] = 0.0
+    behind_deg: Annotated[
+        float, _float("Width of the sector that is behind, around -x [degrees].", ge=1.0, le=360.0)
+    ] = 120.0
+    boxes: Annotated[
+        tuple[tuple[float, float, float, float, float, float], ...],
+        Meta(description="Boxes: x_min, y_min, z_min, x_max, y_max, z_max."),
+    ] = ()
+    cylinders: Annotated[
+        tuple[tuple[float, float, float, float, float], ...],
+        Meta(description="Upright cylinders: x, y, radius, z_min, z_max."),
+    ] = ()
+
+
 class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """Texture from photographs, weighed by reliability (section III-C, refinement/)."""
 
@@ -413,6 +436,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole configuration: one section a stage."""
 
     input: InputConfig = InputConfig()
+    exclusion: ExclusionConfig = ExclusionConfig()
     odometry: OdometryConfig = OdometryConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     mesher: MesherConfig = MesherConfig()

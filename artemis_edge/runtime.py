@@ -107,7 +107,7 @@ def reprocess(
     or the mesh has no triangle; its sentence says what was kept.
     """
     health.restart_peak()
-    source = open_input(request.input, request.config.input)
+    source = open_input(request.input, request.config.input, request.config.exclusion)
     span = frame_span(source, request)
     odometry = choose_odometry(source, request, span)
     prepare(request.out)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from artemis_edge.changed_source import ChangedSource
 from artemis_edge.devices.calibration import Calibration
-from artemis_edge.frames import F64, I64, CameraModel, FrameSource, ImuSamples, SyncedFrame, Trajectory
+from artemis_edge.frames import F64, CameraModel, FrameSource, ImuSamples, SyncedFrame
 from artemis_edge.trajectory import inverse
 
 
@@ -92,27 +92,8 @@ def T_lidar_imu(source: FrameSource) -> F64:
     return T
 
 
-@dataclass(slots=True)
-class CalibratedSource:
+class CalibratedSource(ChangedSource):
     """A FrameSource seen through mounts."""
 
-    source: FrameSource
-    mounts: Mounts
-    name: str = field(init=False)
-    stamp_ns: I64 = field(init=False)
-    poses: Trajectory | None = field(init=False)
-    input_hz: float = field(init=False)
-    lost: dict[str, int] = field(init=False)
-    warnings: list[str] = field(init=False)
-
-    def __post_init__(self) -> None:
-        s = self.source
-        self.name, self.stamp_ns, self.poses, self.input_hz = s.name, s.stamp_ns, s.poses, s.input_hz
-        self.lost, self.warnings = s.lost, s.warnings  # the same objects: they grow while it is read
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[SyncedFrame]:
-        """Frames ``start <= index < stop`` with these mounts and times."""
-        return (self.mounts.applied(frame) for frame in self.source.frames(start, stop))
+    def __init__(self, source: FrameSource, mounts: Mounts) -> None:
+        super().__init__(source, mounts.applied)

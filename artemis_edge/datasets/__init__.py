@@ -6,21 +6,32 @@ from collections.abc import Callable
 from pathlib import Path
 
 from artemis_edge.calibrate.mounts import CalibratedSource, Mounts
-from artemis_edge.config import InputConfig
+from artemis_edge.changed_source import ChangedSource
+from artemis_edge.config import ExclusionConfig, InputConfig
 from artemis_edge.datasets.kitti import open_odometry, open_raw
 from artemis_edge.datasets.rosbag import RosbagSource, bag_files
 from artemis_edge.devices.calibration import read_calibration
 from artemis_edge.errors import InputError
+from artemis_edge.exclusion import Zones
 from artemis_edge.frames import FrameSource, Trajectory
 
 _KINDS = "a session or ROS bag (.mcap, .db3, .bag) or a KITTI folder (with velodyne or velodyne_points)"
 
 
-def open_input(path: Path, config: InputConfig | None = None) -> FrameSource:
+def open_input(
+    path: Path, config: InputConfig | None = None, exclusion: ExclusionConfig | None = None
+) -> FrameSource:
     """The frames of a recording or data set, recognised by what it holds; ``config`` chooses topics of a bag.
 
-    Raises InputError, one sentence, if there is nothing at the path that can be read.
+    Points in the zones of ``exclusion`` are left out. Raises InputError, one sentence, if there is nothing at the path
+    that can be read.
     """
+    zones = Zones.of(exclusion or ExclusionConfig())
+    source = _opened(path, config)
+    return ChangedSource(source, zones.applied) if zones else source
+
+
+def _opened(path: Path, config: InputConfig | None) -> FrameSource:
     opener = _opener(path)
     if opener is None:
         raise InputError(_unknown(path))
@@ -33,7 +44,8 @@ def open_input(path: Path, config: InputConfig | None = None) -> FrameSource:
 
 def lidar_poses(source: FrameSource, given: Trajectory) -> Trajectory:
     """Given poses as those of the primary LiDAR: see ``RosbagSource.lidar_poses``."""
-    source = source.source if isinstance(source, CalibratedSource) else source
+    while isinstance(source, ChangedSource):
+        source = source.source
     return source.lidar_poses(given) if isinstance(source, RosbagSource) else given
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from artemis_edge import topics
 from artemis_edge.config import Config, to_toml
 from artemis_edge.errors import InputError, RunError
+from artemis_edge.exclusion import Zones
 from artemis_edge.frames import MeshDelta, SyncedFrame, Trajectory
 from artemis_edge.keeper import Keeper
 from artemis_edge.mapping_run import Mapper
@@ -51,6 +52,7 @@ class StreamMapping:
     def __init__(self, config: Config, pages: Path, make: MakeMapper = pipeline, name: str = "live") -> None:
         self.config = config
         self.assembler = FrameAssembler()
+        self._zones = Zones.of(config.exclusion)
         self.odometry = LateOdometry(config.odometry)
         self.mapper: Mapper = make(config, self.odometry, pages)
         self.keeper = Keeper(pages, config.keep, config.segmentation)
@@ -69,7 +71,7 @@ class StreamMapping:
         if frame is None:
             return False
         self.latest_ns = frame.stamp_ns
-        for ready in self._ready(frame):
+        for ready in self._ready(self._zones.applied(frame)):
             self._one(ready)
         return True
 
