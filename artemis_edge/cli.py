@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 from artemis_edge.commands import (
     calibrate,
+    georeference,
     models,
     output,
     replay,
@@ -112,6 +113,7 @@ def _parser() -> argparse.ArgumentParser:
         models.add,
         rig.add,
         calibrate.add,
+        georeference.add,
         tui.add,
     ):
         add(commands)

@@ -36,6 +36,10 @@ def add_export(commands: Any) -> None:
         "--textured", action=argparse.BooleanOptionalAction, default=True,
         help="with the photographs' texture, where the format can hold it (default)",
     )  # fmt: skip
+    parser.add_argument(
+        "--georeferenced", action=argparse.BooleanOptionalAction, default=True,
+        help="in the coordinates that `georeference` gave the map, if it did (default)",
+    )  # fmt: skip
 
 
 def run_render(given: argparse.Namespace) -> int:
@@ -56,5 +60,5 @@ def run_export(given: argparse.Namespace) -> int:
     if given.format != "colmap" and given.out.is_dir():
         raise InputError(f"{given.out} is a folder; --out needs the name of a file")
     with progress(f"writing {given.format}") as report:
-        write(given.map, given.format, given.out, given.textured, report)
+        write(given.map, given.format, given.out, given.textured, report, given.georeferenced)
     return DONE

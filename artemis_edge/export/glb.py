@@ -12,6 +12,7 @@ import json
 import shutil
 import struct
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -44,8 +45,16 @@ _JPEG = [
 ]  # fmt: skip
 
 
-def write_glb(path: Path, mesh: Mesh, atlas: Atlas | None = None, report: Report = silent) -> None:
+def write_glb(
+    path: Path,
+    mesh: Mesh,
+    atlas: Atlas | None = None,
+    report: Report = silent,
+    remarks: Mapping[str, Any] | None = None,
+) -> None:
     """Write ``mesh``; world z becomes glTF y. The same mesh and atlas give the same bytes.
+
+    ``remarks`` stand in the asset's ``extras``.
 
     Raises InputError for coordinates that are not finite, RunError when the file cannot be written.
     """
@@ -64,7 +73,10 @@ def write_glb(path: Path, mesh: Mesh, atlas: Atlas | None = None, report: Report
             else:
                 document.add_textured(mesh, mesh.faces[chosen], atlas.pages[number], atlas.uv[chosen])
             report(done + 1, len(numbers))
-        _write_container(file, document.finish(mesh.label_names), spool, document.size)
+        content = document.finish(mesh.label_names)
+        if remarks:
+            content["asset"]["extras"] = dict(remarks)
+        _write_container(file, content, spool, document.size)
 
 
 class _Document:

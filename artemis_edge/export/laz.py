@@ -2,6 +2,7 @@
 
 ``classification`` is the label of the mesh where it is near (0: background or no mesh); the names of the labels stand
 in the file's classification lookup. GPS time is session time in seconds. Colours are 0 where no image saw the point.
+Of a map with a georeference the coordinates are those of its CRS, which stands in the file as WKT.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import replacing
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F32, F64, U8
+from artemis_edge.geo.place import Placed
 from artemis_edge.kept_points import TICKS_PER_S, KeptPoints, Rows
 from artemis_edge.progress import Report, silent
 
@@ -28,15 +30,18 @@ _LABEL_REACH_M = 0.2
 _EIGHT_TO_SIXTEEN = 257  # 255 becomes 65535, as LAS demands
 # Classification lookup of LAS 1.2 to 1.4: 256 entries of a class number and a name of 15 bytes
 _LOOKUP_USER, _LOOKUP_RECORD, _LOOKUP_NAME = "LASF_Spec", 0, 15
+_WKT_USER, _WKT_RECORD = "LASF_Projection", 2112
 
 
-def write_laz(path: Path, kept: KeptPoints, mesh: Mesh, report: Report = silent) -> None:
+def write_laz(
+    path: Path, kept: KeptPoints, mesh: Mesh, report: Report = silent, placed: Placed | None = None
+) -> None:
     """Write the points of a map; the same map gives the same bytes, whatever the day.
 
     Raises InputError when laspy is not installed, RunError when the file cannot be written.
     """
     laspy = _laspy()
-    header = _header(laspy, kept, mesh.label_names)
+    header = _header(laspy, kept, mesh.label_names, placed)
     labels = _Labels(mesh)
     total, done = kept.rows, 0
     with replacing(path) as file:
@@ -45,7 +50,7 @@ def write_laz(path: Path, kept: KeptPoints, mesh: Mesh, report: Report = silent)
             file, mode="w", header=header, do_compress=True, laz_backend=backend, closefd=False
         ) as las:
             for rows in kept.chunks():
-                las.write_points(_records(laspy, header, rows, kept, labels))
+                las.write_points(_records(laspy, header, rows, kept, labels, placed))
                 done += len(rows)
                 report(done, total)
 
@@ -62,9 +67,9 @@ def _laspy() -> Any:
     return laspy
 
 
-def _header(laspy: Any, kept: KeptPoints, names: dict[int, str]) -> Any:
+def _header(laspy: Any, kept: KeptPoints, names: dict[int, str], placed: Placed | None) -> Any:
     header = laspy.LasHeader(version=_VERSION, point_format=_POINT_FORMAT)
-    low, high = _bounds(kept)
+    low, high = _bounds(kept, placed)
     header.scales = np.full(3, _STEP_M)
     header.offsets = np.floor(0.5 * (low + high))
     header.generating_software = _GENERATOR
@@ -78,14 +83,24 @@ def _header(laspy: Any, kept: KeptPoints, names: dict[int, str]) -> Any:
             record_data=_lookup(names),
         )
     )
+    if placed is not None:
+        header.global_encoding.wkt = True
+        header.vlrs.append(
+            laspy.VLR(
+                user_id=_WKT_USER,
+                record_id=_WKT_RECORD,
+                description="coordinate reference system",
+                record_data=placed.georeference.wkt.encode() + b"\0",
+            )
+        )
     return header
 
 
-def _bounds(kept: KeptPoints) -> tuple[F64, F64]:
+def _bounds(kept: KeptPoints, placed: Placed | None) -> tuple[F64, F64]:
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for rows in kept.chunks():
-        low = np.minimum(low, rows["position"].min(axis=0))
-        high = np.maximum(high, rows["position"].max(axis=0))
+        position = _position(rows, placed)
+        low, high = np.minimum(low, position.min(axis=0)), np.maximum(high, position.max(axis=0))
     half_range_m = np.iinfo(np.int32).max * _STEP_M
     if not (high - low < half_range_m).all():
         raise InputError("the points spread over more than 2,000 km; their poses must be wrong")
@@ -100,9 +115,16 @@ def _lookup(names: dict[int, str]) -> bytes:
     return bytes(entries)
 
 
-def _records(laspy: Any, header: Any, rows: Rows, kept: KeptPoints, labels: _Labels) -> Any:
+def _position(rows: Rows, placed: Placed | None) -> F64:
+    """In the map, or in its CRS."""
+    return rows["position"].astype(np.float64) if placed is None else placed.to_crs(rows["position"])
+
+
+def _records(
+    laspy: Any, header: Any, rows: Rows, kept: KeptPoints, labels: _Labels, placed: Placed | None
+) -> Any:
     out = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
-    position = rows["position"].astype(np.float64)
+    position = _position(rows, placed)
     out.x, out.y, out.z = position[:, 0], position[:, 1], position[:, 2]
     out.intensity = rows["intensity"]
     out.gps_time = kept.zero_ns * 1e-9 + rows["tick"] / TICKS_PER_S

@@ -6,6 +6,7 @@ carry their colour as three more numbers, as MeshLab and Blender read it. A pict
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,8 +25,14 @@ _ROWS_AT_ONCE = 100_000
 _PLAIN = "vertex_colours"
 
 
-def write_obj(path: Path, mesh: Mesh, atlas: Atlas | None = None, report: Report = silent) -> None:
-    """Write ``mesh`` and, with an atlas, the material file and pictures beside it.
+def write_obj(
+    path: Path,
+    mesh: Mesh,
+    atlas: Atlas | None = None,
+    report: Report = silent,
+    remarks: Sequence[str] = (),
+) -> None:
+    """Write ``mesh`` and, with an atlas, the material file and pictures beside it; ``remarks`` as comments.
 
     Raises InputError for a name that a material cannot bear, RunError when a file cannot be written.
     """
@@ -38,6 +45,7 @@ def write_obj(path: Path, mesh: Mesh, atlas: Atlas | None = None, report: Report
             write_bytes(path.with_name(name), png_bytes(atlas.pages[number]))
         write_bytes(path.with_suffix(".mtl"), _materials(pictures).encode())
     with replacing(path) as file:
+        file.write("".join(f"# {remark}\n" for remark in remarks).encode())
         file.write(f"# artemis-edge: metres, z up\n{_library(path, atlas)}o map\n".encode())
         _write_vertices(file, mesh)
         _write_faces(file, mesh, atlas, pictures, report)

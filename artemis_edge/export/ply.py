@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -64,12 +65,13 @@ def find_mesh(map_path: Path) -> Path:
     return path
 
 
-def write_ply(path: Path, mesh: Mesh) -> None:
+def write_ply(path: Path, mesh: Mesh, remarks: Sequence[str] = ()) -> None:
     """Write ``mesh`` as binary little-endian PLY with one ``comment label N NAME`` line a class.
 
-    Equal meshes give equal bytes. Raises RunError when the file cannot be written; no half file is left.
+    ``remarks`` are further comments. Equal meshes give equal bytes. Raises RunError when the file cannot be written;
+    no half file is left.
     """
-    comments = "".join(
+    comments = "".join(f"comment {remark}\n" for remark in remarks) + "".join(
         f"comment label {label} {' '.join(name.split())}\n"
         for label, name in sorted(mesh.label_names.items())
     )

@@ -1,0 +1,1 @@
+"""A map in the coordinates of a country: control points, the fit, what is written (extra ``geo``)."""
