@@ -150,7 +150,11 @@ def test_between_has_two_landmarks() -> None:
         ("all of the cars", ["car"]),
         ("person holding umbrella", ["person"]),
         ("the person holding an umbrella", ["person"]),
-        ("tree taller than the car", ["tree taller than"]),  # not understood, and never the car
+        ("tree taller than the car", ["tree"]),  # and never the car
+        ("person 2 m from the bench", ["person"]),
+        ("person similar to bench", ["person similar"]),  # not understood, and never the bench
+        ("light green car", ["car"]),
+        ("street light", ["lamp post"]),
         ("person nearest the bench", ["person"]),
         ("the nearest bench", ["bench"]),
     ],
@@ -180,6 +184,9 @@ def test_negations() -> None:
     assert parse("person without a backpack").targets[0].relations[0].negated
     assert "not something" in parse("not a car").reason
     assert "not something" in parse("person next to not a car").reason
+    assert "not something" in parse("everything except the ground").reason
+    both = (Attribute("colour", "red", True), Attribute("colour", "blue", True))
+    assert parse("neither red nor blue car").targets[0].attributes == both
 
 
 @pytest.mark.parametrize(
@@ -222,6 +229,17 @@ _WORDS = st.sampled_from(
         "front",
         "orange",
         ",",
+        "but",
+        "second",
+        "two",
+        "taller",
+        "than",
+        "within",
+        "2.5",
+        "m",
+        "light",
+        "closest",
+        "from",
         "🚗",
         "x",
     ]
@@ -257,6 +275,26 @@ def test_unknown_words_are_not_guessed() -> None:
     asked = understand("rusty car", Closed())
     assert asked.status is Status.APPROXIMATE
     assert "'rusty' was not understood" in asked.reason
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("persn", "did you mean 'person'?"),
+        ("red cra", "did you mean 'car'?"),
+        ("pedestrain", "did you mean 'pedestrian'?"),
+        ("Bäume", "understood in English: try 'tree'"),
+        ("Person neben der Bank", "understood in English: try 'person' or 'bench'"),
+        ("木", "understood in English"),
+        ("giraffe", ""),  # a word that is known, and no slip
+        ("zorblax", ""),
+    ],
+)
+def test_what_may_have_been_meant_is_told_and_not_acted_upon(text: str, said: str) -> None:
+    asked = understand(text, Closed())
+    assert (asked.status, asked.classes) == (Status.UNSUPPORTED, ())
+    assert asked.reason.endswith(said)
+    assert said or ";" not in asked.reason
 
 
 def test_landmarks_need_slots_and_may_be_unknown() -> None:
@@ -307,6 +345,21 @@ def test_a_full_table_takes_nothing() -> None:
         ("person far from the cars", [5], Status.MATCHED),
         ("car between the bench and the tree", [], Status.NOT_FOUND),
         ("something brown", [3], Status.APPROXIMATE),
+        ("dark blue car", [2], Status.APPROXIMATE),
+        ("light red car", [], Status.NOT_FOUND),
+        ("the two tallest trees", [6, 7], Status.MATCHED),
+        ("second tallest tree", [7], Status.MATCHED),
+        ("the third tallest tree", [], Status.NOT_FOUND),
+        ("the closest car to the bench", [1], Status.MATCHED),
+        ("the farthest person from the bench", [5], Status.MATCHED),
+        ("trees taller than the car", [6, 7], Status.MATCHED),
+        ("tree shorter than the tree", [7], Status.MATCHED),
+        ("trees higher than 6.5m", [6], Status.MATCHED),
+        ("trees not higher than 6.5 metres", [7], Status.MATCHED),
+        ("something bigger than 3 m", [1, 2, 6, 7], Status.APPROXIMATE),
+        ("person within 90 cm of the bench", [4], Status.MATCHED),
+        ("person not within 1 m of the bench", [5], Status.MATCHED),
+        ("person within 2 m of the unicorn", [4, 5], Status.APPROXIMATE),
         ("truck", [], Status.NOT_FOUND),
         ("giraffe", [], Status.UNSUPPORTED),
         ("car and person", [1, 2, 4, 5], Status.MATCHED),

@@ -166,4 +166,21 @@ def seen_from(viewpoint: F64, kind: str, one: Box, other: Box) -> float:
     return _below(abs(across) - span * wanted, 0.0, max(wanted, _TOUCH_SOFT_M))
 
 
+def exceeds(kind: str, value: float, limit: float) -> bool:
+    """Whether one of COMPARED is true of two measures."""
+    return value > limit if kind.startswith("more_") else value < limit
+
+
+#: Comparisons with a landmark or a length, and what of the boxes they compare.
+COMPARED: Mapping[str, str] = MappingProxyType(
+    {
+        **{
+            "more_height": "height",
+            "less_height": "height",
+            "more_volume": "volume",
+            "less_volume": "volume",
+        },
+        **{"more_length": "length", "more_width": "width", "less_width": "width"},
+    }
+)
 VIEWED: Sequence[str] = ("left_of", "right_of", "behind", "in_front_of")

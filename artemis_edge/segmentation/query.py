@@ -7,6 +7,7 @@ that are not understood are kept and told, never guessed.
 
 from __future__ import annotations
 
+import re
 import tomllib
 import unicodedata
 from collections.abc import Sequence
@@ -21,11 +22,16 @@ _MOST_WORDS = 40
 _PUNCTUATION = ",;&"
 _IN_WORDS = "-'"
 _APOSTROPHE = "\u2019"
+_LENGTH = re.compile(r"([0-9])(c?m)\b")  # "3m" is two words
+_NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,3})?")
 _BETWEEN = "between"
+_NEAREST, _FARTHEST = ("nearest", "to"), ("farthest", "from")
 _DOING = ("ing", "ed")
+_COMPARING = ("more_", "less_")
 # "person in red" and "car with red" say a colour of the thing itself
 _OF_ITSELF = ("inside", "next_to")
 _WITHOUT = "without"
+_NUMBERS = ("count", "rank")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,19 +45,28 @@ class Attribute:
 
 @dataclass(frozen=True, slots=True)
 class Superlative:
-    """``measure`` height, volume, length, width or distance; the most of it, or the least."""
+    """``measure`` height, volume, length, width or distance; the most of it, or the least.
+
+    ``count`` of them, from the ``rank``-th on: "the two tallest", "the second tallest".
+    """
 
     measure: str
     most: bool
+    count: int = 1
+    rank: int = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """How an object lies to others, ``kind`` as in query.toml; ``between`` has two landmarks, others one."""
+    """How an object lies to others, ``kind`` as in query.toml; ``between`` has two landmarks, others one.
+
+    ``metres``: of "taller than 3 m", which has no landmark, and of "within 2 m of" it (kind ``within``).
+    """
 
     kind: str
     landmarks: tuple[Phrase, ...]
     negated: bool = False
+    metres: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +103,11 @@ class _Grammar:
     sizes: dict[str, str]
     superlatives: dict[str, str]
     relations: dict[str, str]
+    lighter: dict[str, str]
+    parting: dict[str, str]
+    counts: dict[str, str]
+    ranks: dict[str, str]
+    units: dict[str, str]
 
 
 @lru_cache(maxsize=1)
@@ -125,13 +145,19 @@ def parse(text: str) -> Query:
 def tokens(text: str) -> list[str]:
     """Words in lower case; commas and the like are words of their own, other signs are not words."""
     plain = unicodedata.normalize("NFKC", text).lower().replace(_APOSTROPHE, "'")
+    plain = _LENGTH.sub(r"\1 \2 ", plain)
     spaced = "".join(
         character if character.isalnum() or character in _IN_WORDS else
-        f" {character} " if character in _PUNCTUATION else " "
-        for character in plain
+        f" {character} " if character in _PUNCTUATION else
+        character if character == "." and _is_decimal(plain, k) else " "
+        for k, character in enumerate(plain)
     )  # fmt: skip
     words = (word.strip(_IN_WORDS) for word in spaced.split())
     return [word.removesuffix("'s") for word in words if word]
+
+
+def _is_decimal(text: str, k: int) -> bool:
+    return "0" <= text[k - 1 : k] <= "9" and "0" <= text[k + 1 : k + 2] <= "9"
 
 
 def _only_attributes(phrase: Phrase) -> bool:
@@ -199,7 +225,10 @@ def _has_noun(words: Sequence[str]) -> bool:
     grammar = _grammar()
     k = 0
     while k < len(words):
-        tables = (grammar.filler, grammar.colours, grammar.sizes, grammar.superlatives, grammar.negation)
+        tables = (
+            *(grammar.filler, grammar.colours, grammar.sizes, grammar.superlatives, grammar.negation),
+            *(grammar.counts, grammar.ranks),
+        )
         step = max(_match(words, k, table)[1] for table in tables)
         if not step:
             return True
@@ -209,12 +238,19 @@ def _has_noun(words: Sequence[str]) -> bool:
 
 def _phrase(words: Sequence[str]) -> Phrase:
     """One object and what it is related to; a landmark may have relations of its own."""
+    words = _reordered(words)
     start, kind, size = _first_relation(words)
     if not kind:
         return _simple(words)
     negated = start > 0 and words[start - 1] in _grammar().negation
     target = _simple(words[: start - 1] if negated else words[:start])
     rest = list(words[start + size :])
+    metres, taken = _length(rest)
+    if taken and kind.startswith(_COMPARING) and not rest[taken:]:
+        return replace(target, relations=(Relation(kind, (), negated, metres),))
+    if taken and words[start] == "within" and rest[taken : taken + 1] in (["of"], ["from"]):
+        landmark = _phrase(rest[taken + 1 :])
+        return replace(target, relations=(Relation("within", (landmark,), negated, metres),))
     sides = _sides(rest) if kind == _BETWEEN else [rest]
     landmarks = tuple(_phrase(side) for side in sides if side)
     if not landmarks or (kind == _BETWEEN and len(landmarks) < 2):
@@ -224,6 +260,33 @@ def _phrase(words: Sequence[str]) -> Phrase:
     if kind in _OF_ITSELF and not negated and _only_attributes(landmarks[0]):
         return replace(target, attributes=(*target.attributes, *landmarks[0].attributes))
     return replace(target, relations=(Relation(kind, landmarks, negated),))
+
+
+def _reordered(words: Sequence[str]) -> Sequence[str]:
+    """ "closest tree to the bench" as "tree nearest to the bench"."""
+    for k in range(len(words)):
+        name, size = _match(words, k, _grammar().superlatives)
+        if name.endswith("distance"):
+            break
+        if _match(words, k, _grammar().relations)[1]:
+            return words
+    else:
+        return words
+    relation = _NEAREST if name.startswith("least") else _FARTHEST
+    for j in range(k + size, len(words)):
+        if words[j] == relation[1] and _has_noun(words[k + size : j]):
+            return [*words[:k], *words[k + size : j], *relation, *words[j + 1 :]]
+        if _match(words, j, _grammar().relations)[1]:
+            break
+    return words
+
+
+def _length(words: Sequence[str]) -> tuple[float, int]:
+    """Metres that words begin with, "3.5 m", and how many words that are; 0, 0 where they do not."""
+    if not words or not _NUMBER.fullmatch(words[0]):
+        return 0.0, 0
+    unit, size = _match(words, 1, _grammar().units)
+    return (float(words[0]) * float(unit), 1 + size) if size else (0.0, 0)
 
 
 def _sides(words: list[str]) -> list[list[str]]:
@@ -248,7 +311,7 @@ def _first_relation(words: Sequence[str]) -> tuple[int, str, int]:
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """A word or a few of them: ``role`` colour, size, superlative, noun, negation, filler or unknown."""
+    """A word or a few of them: ``role`` colour, size, superlative, count, rank, noun, negation, filler, unknown."""
 
     role: str
     name: str
@@ -261,6 +324,8 @@ def _pieces(words: Sequence[str]) -> list[_Piece]:
         "colour": grammar.colours,
         "size": grammar.sizes,
         "superlative": grammar.superlatives,
+        "count": grammar.counts,
+        "rank": grammar.ranks,
         "negation": grammar.negation,
         "filler": {**grammar.filler, **grammar.thing, **grammar.pronoun},
     }
@@ -288,7 +353,7 @@ def _noun(words: Sequence[str], start: int) -> tuple[str, int]:
 
 def _simple(words: Sequence[str]) -> Phrase:
     """A noun with its attributes."""
-    pieces = _colour_or_fruit(_pieces(words))
+    pieces = _numbers(_light_colours(_colour_or_fruit(_pieces(words))))
     noun, ignored = _head(pieces)
     attributes: list[Attribute] = []
     superlative: Superlative | None = None
@@ -301,12 +366,29 @@ def _simple(words: Sequence[str]) -> Phrase:
             negated = False
         elif piece.role == "superlative":
             amount, measure = piece.name.split()
-            superlative = Superlative(measure, amount == "most")
+            numbers = {other.role: int(other.name) for other in pieces if other.role in _NUMBERS}
+            superlative = Superlative(measure, amount == "most", **numbers)
         elif piece.role in ("noun", "unknown") and negated:
             break  # "not a car": the negation stays open
     if negated:
         ignored = ("not", *ignored)
     return Phrase(noun, tuple(attributes), superlative, (), ignored)
+
+
+def _numbers(pieces: list[_Piece]) -> list[_Piece]:
+    """Numbers mean something beside a superlative only."""
+    if any(piece.role == "superlative" for piece in pieces):
+        return pieces
+    return [replace(p, role="unknown", name=" ".join(p.words)) if p.role in _NUMBERS else p for p in pieces]
+
+
+def _light_colours(pieces: list[_Piece]) -> list[_Piece]:
+    """ "light" before a colour is bright; elsewhere it is what it was taken for."""
+    out = list(pieces)
+    for k in range(len(pieces) - 1):
+        if " ".join(pieces[k].words) in _grammar().lighter and pieces[k + 1].role == "colour":
+            out[k] = _Piece("colour", "bright", pieces[k].words)
+    return out
 
 
 def _colour_or_fruit(pieces: list[_Piece]) -> list[_Piece]:
@@ -339,11 +421,15 @@ def _head(pieces: Sequence[_Piece]) -> tuple[str, tuple[str, ...]]:
     return " ".join([*first, singular(last)]), tuple(others)
 
 
+def _parts_from_noun(word: str) -> bool:
+    return word.endswith(_DOING) or word in _grammar().parting or word[0] in "0123456789"
+
+
 def _groups(pieces: Sequence[_Piece]) -> list[list[_Piece]]:
-    """Nouns and unknown words in runs, parted by fillers, and by doing words after a noun."""
+    """Nouns and unknown words in runs, parted by fillers, and after a noun by doing words, numbers and the like."""
     groups: list[list[_Piece]] = [[]]
     for piece in pieces:
-        doing = piece.role == "unknown" and piece.name.endswith(_DOING)
+        doing = piece.role == "unknown" and _parts_from_noun(piece.name)
         if piece.role == "filler":
             groups.append([])
         elif doing and any(before.role == "noun" for before in groups[-1]):

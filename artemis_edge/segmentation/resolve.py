@@ -8,6 +8,7 @@ from typing import Protocol
 
 from artemis_edge.errors import InputError
 from artemis_edge.segmentation.backend import MOST_SLOTS, Prompt, Status, Support
+from artemis_edge.segmentation.hints import hint
 from artemis_edge.segmentation.query import Phrase, Query, parse
 from artemis_edge.segmentation.words import canonical, vocabulary
 
@@ -70,7 +71,8 @@ def resolve(noun: str, backend: Knower) -> Resolved:
         if above in own:
             reason = f"the model {backend.name} knows '{above}' only, not '{noun}' among them"
             return Resolved(noun, (above,), Status.APPROXIMATE, reason)
-    return Resolved(noun, (), Status.UNSUPPORTED, direct.reason)
+    reasons = (direct.reason, hint(noun, own))
+    return Resolved(noun, (), Status.UNSUPPORTED, "; ".join(reason for reason in reasons if reason))
 
 
 def understand(text: str, backend: Knower) -> Understanding:

@@ -31,6 +31,7 @@ _SIZES: Mapping[str, tuple[str, float]] = {
     "narrow": ("width", -1.0),
 }
 _FLAT, _UPRIGHT = 0.4, 1.5
+_LIGHTNESS = ("dark", "bright")
 
 
 class MapObject(Protocol):
@@ -103,9 +104,9 @@ class _Search:
         return {k: score for k, score in likely.items() if score > 0.0}
 
     def _attributed(self, scores: dict[int, float], attributes: Sequence[Attribute]) -> dict[int, float]:
-        """Any of the colours asked for, all of the sizes, none of what is negated."""
-        colours = [a for a in attributes if a.kind == "colour" and not a.negated]
-        others = [a for a in attributes if a.kind != "colour" or a.negated]
+        """Any of the colours asked for, all of the sizes and lightnesses, none of what is negated."""
+        colours = [a for a in attributes if _is_hue(a) and not a.negated]
+        others = [a for a in attributes if not _is_hue(a) or a.negated]
         peers = [self.objects[k] for k in scores]
         out = {}
         for k, score in scores.items():
@@ -129,6 +130,8 @@ class _Search:
 
     def _related(self, scores: dict[int, float], relation: Relation) -> dict[int, float]:
         """Those that have the relation to some landmark; unchanged where it cannot be judged."""
+        if relation.metres:
+            return self._measured(scores, relation)
         unknown = [p.noun for p in relation.landmarks if p.noun and not self.asked.nouns[p.noun].classes]
         if unknown:  # told by the understanding already
             return scores
@@ -147,12 +150,33 @@ class _Search:
                 out[k] = score * fit
         return out
 
+    def _measured(self, scores: dict[int, float], relation: Relation) -> dict[int, float]:
+        """Those that a length in metres is true of: "taller than 3 m", "within 2 m of the bench"."""
+        if any(p.noun and not self.asked.nouns[p.noun].classes for p in relation.landmarks):
+            return scores  # told by the understanding already
+        near = [k for landmark in relation.landmarks for k in self.find(landmark)]
+        out = {}
+        for k, score in scores.items():
+            box = self.objects[k].box
+            if relation.landmarks:
+                gaps = [layout.gap(box, self.objects[j].box) for j in near if j != k]
+                true = min(gaps, default=np.inf) <= relation.metres
+            else:
+                true = layout.exceeds(relation.kind, _length_of(box, relation.kind), relation.metres)
+            if true != relation.negated:
+                out[k] = score
+        return out
+
     def _relation_fit(self, k: int, kind: str, sides: Sequence[Sequence[int]]) -> float:
         box = self.objects[k].box
         others = [[self.objects[j].box for j in side if j != k] for side in sides]
         if kind == "between":
             pairs = ((a, b) for a in others[0] for b in others[1] if a is not b)
             return max((layout.between(box, a, b) for a, b in pairs), default=0.0)
+        if kind in layout.COMPARED:
+            measure = layout.COMPARED[kind]
+            own = box.measure(measure)
+            return float(any(layout.exceeds(kind, own, other.measure(measure)) for other in others[0]))
         if kind == "far_from":  # far from all of them
             return min((layout.RELATIONS[kind](box, other) for other in others[0]), default=0.0)
         if kind in layout.VIEWED and self.viewpoint is not None:
@@ -173,7 +197,7 @@ class _Search:
         return {best: scores[best]}
 
     def _most(self, scores: dict[int, float], superlative: Superlative) -> dict[int, float]:
-        """The one object with the most or least of something."""
+        """The object, or the few, with the most or least of something."""
         if superlative.measure == "distance" and self.viewpoint is None:
             self.left_out["'nearest' and 'farthest' need somebody who looks, and were left out"] = None
             return scores
@@ -181,13 +205,25 @@ class _Search:
             return scores
         value = {k: self._value(self.objects[k].box, superlative.measure) for k in scores}
         sign = -1.0 if superlative.most else 1.0
-        best = min(value, key=lambda k: (sign * value[k], k))
-        return {best: scores[best]}
+        ranked = sorted(value, key=lambda k: (sign * value[k], k))
+        first = superlative.rank - 1
+        return {k: scores[k] for k in ranked[first : first + superlative.count]}
 
     def _value(self, box: Box, measure: str) -> float:
         if measure == "distance" and self.viewpoint is not None:
             return layout.gap(box, Box(np.asarray(self.viewpoint, float), np.zeros(3)))
         return box.measure(measure)
+
+
+def _is_hue(attribute: Attribute) -> bool:
+    """Of the hues that are asked for any will do; a "dark blue" thing is both."""
+    return attribute.kind == "colour" and attribute.word not in _LIGHTNESS
+
+
+def _length_of(box: Box, kind: str) -> float:
+    """What a length in metres is compared with: where nothing else is said, the longest side."""
+    measure = layout.COMPARED[kind]
+    return float(np.max(box.size)) if measure == "volume" else box.measure(measure)
 
 
 def size_fit(item: MapObject, word: str, peers: Sequence[MapObject]) -> float:

@@ -14,11 +14,13 @@ _NOT_PLURAL = ("ss", "us", "is")
 
 @dataclass(frozen=True, slots=True)
 class Vocabulary:
-    """``canonical`` name by every spelling; ``covers``: the narrower words of a word; ``plurals``: irregular ones."""
+    """``canonical`` name by every spelling; ``covers``: the narrower words of a word; ``plurals``: irregular ones;
+    ``foreign``: names by words of other languages, for hints only."""
 
     canonical: dict[str, str]
     covers: dict[str, tuple[str, ...]]
     plurals: dict[str, str]
+    foreign: dict[str, str]
 
     def find(self, word: str) -> str | None:
         """Canonical name of a word or phrase in singular or plural; None where it is not known."""
@@ -59,7 +61,10 @@ def vocabulary() -> Vocabulary:
     canonical = {name: name for name in _nouns(synonyms, kinds, tree["more"]["nouns"])}
     canonical.update({word: name for name, words in synonyms.items() for word in words})
     covers = {name: tuple(below) for name, below in kinds.items()}
-    return Vocabulary(canonical, covers, tree["plurals"])
+    foreign = {
+        word: name for name, words in tree["foreign"].items() for word in words if word not in canonical
+    }
+    return Vocabulary(canonical, covers, tree["plurals"], foreign)
 
 
 def _nouns(synonyms: dict[str, list[str]], kinds: dict[str, list[str]], more: list[str]) -> Iterable[str]:
