@@ -1,6 +1,12 @@
-"""Lens distortion of the Brown-Conrady model (Brown 1971), and its inverse per pixel."""
+"""Lenses: distortion of the Brown-Conrady model (Brown 1971) with its inverse per pixel, and fall-off of the light.
+
+The fall-off is that of the pixel's value, not of the light: its logarithm is a polynomial of the squared distance from
+the principal point, without a constant (cf. Goldman & Chen 2005).
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -71,6 +77,29 @@ def undistorted_lines(camera: CameraModel) -> F32:
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     _undistort_pixels(focal, centre, distortion, fold_radius(distortion), lines)
     return lines
+
+
+def corner_radius2(camera: CameraModel) -> float:
+    """Squared distance of the farthest corner from the principal point [pixels^2]."""
+    x = max(camera.cx, camera.width - camera.cx)
+    y = max(camera.cy, camera.height - camera.cy)
+    return float(x * x + y * y)
+
+
+def log_falloff(coefficients: F64 | Sequence[float], q: F64) -> F64:
+    """Logarithm of the fall-off, a1 q + a2 q^2 + ..., at squared distances ``q``, 1 in the farthest corner."""
+    total = np.zeros(np.shape(q))
+    for a in reversed(list(coefficients)):
+        total = (total + a) * q
+    return total
+
+
+def falloff(camera: CameraModel, coefficients: Sequence[float]) -> F32:
+    """What the lens leaves of a pixel's value, float32 (h, w), 1 at the principal point."""
+    x = (np.arange(camera.width) - camera.cx) ** 2
+    y = (np.arange(camera.height) - camera.cy) ** 2
+    q = (x + y[:, None]) / corner_radius2(camera)
+    return np.exp(log_falloff(coefficients, q)).astype(np.float32)
 
 
 def fold_radius(distortion: F64) -> float:

@@ -21,11 +21,16 @@ LABELS = {0: "background"}
 
 
 def gather_mesh(
-    pager: Pager, longest_m: float, smallest_island: int, semantics: SemanticMap | None = None
+    pager: Pager,
+    longest_m: float,
+    smallest_island: int,
+    semantics: SemanticMap | None = None,
+    exposure: float = 1.0,
 ) -> Mesh:
     """All patches as one finished mesh (finishing.py) with shared vertices; unused vertices are left out.
 
     With ``semantics`` vertices carry their most probable class, and what no image saw that of its surroundings.
+    Colours are multiplied by ``exposure``.
     """
     ids, triangle_ids = [], []
     for page in pager.pages():
@@ -35,7 +40,7 @@ def gather_mesh(
     order = np.argsort(vertex_id)
     faces = _join(vertex_id, order, triangle_ids)
     del triangle_ids
-    position, normal, sure, colour = _attributes(pager, len(vertex_id))
+    position, normal, sure, colour = _attributes(pager, len(vertex_id), exposure)
     lam = None if semantics is None else _classes(pager, len(vertex_id))
     klass = None if lam is None else clear_classes(lam)
     faces = finish(position, normal, faces, longest_m, smallest_island, klass)
@@ -69,7 +74,7 @@ def _join(vertex_id: I64, order: I64, triangle_ids: list[I64]) -> I32:
     return np.concatenate(out) if out else np.empty((0, 3), np.int32)
 
 
-def _attributes(pager: Pager, n: int) -> tuple[F32, F32, F32, U8]:
+def _attributes(pager: Pager, n: int, exposure: float) -> tuple[F32, F32, F32, U8]:
     """Position (n, 3), normal (n, 3), confidence (n,) and colour (n, 3) of all living vertices, in order of pages."""
     position, normal = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
     sure, colour = np.empty(n, np.float32), np.full((n, 3), GREY, np.uint8)
@@ -80,16 +85,16 @@ def _attributes(pager: Pager, n: int) -> tuple[F32, F32, F32, U8]:
         position[rows] = page.vertex[alive, POSITION : POSITION + 3]
         normal[rows] = page.vertex[alive, NORMAL : NORMAL + 3]
         sure[rows] = confidence(page.evidence[alive])
-        _colour_into(colour[rows], page.attribute[alive])
+        _colour_into(colour[rows], page.attribute[alive], exposure)
         row = rows.stop
     return position, normal, sure, colour
 
 
-def _colour_into(colour: U8, attribute: F32) -> None:
-    """Mean colours (n, 3) of vertices that a camera has seen; the others stay."""
+def _colour_into(colour: U8, attribute: F32, exposure: float) -> None:
+    """Mean colours (n, 3), times ``exposure``, of vertices that a camera has seen; the others stay."""
     if attribute.shape[1] > INFORMATION:
         seen = attribute[:, INFORMATION] > 0.0
-        colour[seen] = (attribute[seen, COLOUR : COLOUR + 3] + 0.5).clip(0, 255)
+        colour[seen] = (attribute[seen, COLOUR : COLOUR + 3] * exposure + 0.5).clip(0, 255)
 
 
 def _classes(pager: Pager, n: int) -> F32:
@@ -106,10 +111,15 @@ def _classes(pager: Pager, n: int) -> F32:
 
 
 def write_mesh(
-    path: Path, pager: Pager, longest_m: float, smallest_island: int, semantics: SemanticMap | None = None
+    path: Path,
+    pager: Pager,
+    longest_m: float,
+    smallest_island: int,
+    semantics: SemanticMap | None = None,
+    exposure: float = 1.0,
 ) -> Mesh:
     """Write ``mesh.ply`` and return what was written."""
-    mesh = gather_mesh(pager, longest_m, smallest_island, semantics)
+    mesh = gather_mesh(pager, longest_m, smallest_island, semantics, exposure)
     write_ply(path, mesh)
     return mesh
 

@@ -51,6 +51,11 @@ class Mapper(Protocol):
         ...
 
     @property
+    def falloff(self) -> Mapping[str, F64]:
+        """Of each camera whose lens's fall-off was found, its coefficients."""
+        ...
+
+    @property
     def probability(self) -> F32:
         """Of each vertex of the written mesh, that of its class; empty without classes."""
         ...

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -153,6 +153,11 @@ class Pipeline:
         return {**{reason: n for reason, n in counts.items() if n}, **self.refinement.lost}
 
     @property
+    def falloff(self) -> Mapping[str, F64]:
+        """Of each camera whose lens's fall-off was found, its coefficients (``lens.log_falloff``)."""
+        return self.refinement.falloff
+
+    @property
     def probability(self) -> F32:
         """Of each vertex of the written mesh, that of its class; empty without classes."""
         return np.empty(0, np.float32) if self.semantics is None else self.semantics.probability
@@ -161,7 +166,9 @@ class Pipeline:
         """Write ``mesh.ply``, finished, and return the mesh."""
         rules = self.config.mesher
         longest_m = rules.long_edge * self.voxel_map.cell_m
-        self._mesh = write_mesh(path, self.pager, longest_m, rules.smallest_island, self.semantics)
+        self._mesh = write_mesh(
+            path, self.pager, longest_m, rules.smallest_island, self.semantics, self.refinement.exposure
+        )
         return self._mesh
 
     def save(self, folder: Path) -> int:

@@ -307,7 +307,7 @@ def write_results(
     results.json("objects.json", {"objects": []})
     photos.remove_earlier()
     if photos.every:
-        lost = results.attempt(INDEX, lambda path: photos.write_index(path, trajectory))
+        lost = results.attempt(INDEX, lambda path: photos.write_index(path, trajectory, mapper.falloff))
         statistics.add_lost({"photos_without_pose": lost} if lost else {})
     mesh = results.attempt("mesh.ply", mapper.write_mesh)
     saved = results.directory("map", lambda folder: (mapper.save(folder), keeper.save(folder, trajectory)))

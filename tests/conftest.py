@@ -1,7 +1,7 @@
 """What several test files share: a small mapper in place of the pipeline, and small inputs."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -61,6 +61,10 @@ class FakeMapper:
     @property
     def warnings(self) -> Sequence[str]:
         return ()
+
+    @property
+    def falloff(self) -> Mapping[str, F64]:
+        return {}
 
     @property
     def probability(self) -> F32:

@@ -19,6 +19,7 @@ from artemis_edge.frames import CameraModel
 from artemis_edge.kept_images import INDEX
 from artemis_edge.kept_points import FILE, ROW, PointSpool, open_points
 from artemis_edge.lens import distort
+from artemis_edge.lens import falloff as darkened
 from artemis_edge.render import render_coloured
 from artemis_edge.splats import NOTHING, blank, lens_of, splat
 from artemis_edge.trajectory import inverse, matrix_from_quaternion
@@ -244,6 +245,23 @@ def test_evaluate_texture_measures_map_and_baseline(room: Path, capsys: pytest.C
     assert common["mesh"]["psnr_gain"] > common["points"]["psnr_gain"]
     assert main(arguments) == 0
     assert "on the pixels that both cover" in capsys.readouterr().out
+
+
+def test_the_lens_fall_off_is_put_back(room: Path) -> None:
+    falloff = (-0.5, 0.1, -0.2)
+    index = json.loads((room / "PHOTOS.json").read_text())
+    for entry in index["photos"]:
+        entry["falloff"] = falloff
+        image = np.asarray(cv2.imread(str(room / entry["file"]))) * darkened(CAMERA, falloff)[..., None]
+        cv2.imwrite(str(room / entry["file"]), np.rint(image).astype(np.uint8))
+    (room / "PHOTOS.json").write_text(json.dumps(index))
+    result = run(room, room / "PHOTOS.json").to_json()
+    assert result["with_falloff"]["psnr_gain"] > 45 > 35 > result["psnr_gain"]
+    common = result["points_baseline"]["common"]
+    assert common["mesh_with_falloff"]["psnr_gain"] > common["mesh"]["psnr_gain"]
+    (room / "PHOTOS.json").write_text(json.dumps({"photos": [index["photos"][0] | {"falloff": "dark"}]}))
+    with pytest.raises(InputError, match="not complete"):
+        run(room, room / "PHOTOS.json")
 
 
 def test_a_bare_mesh_has_no_baseline_and_may_cover_nothing(room: Path, tmp_path: Path) -> None:

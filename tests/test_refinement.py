@@ -158,6 +158,20 @@ def test_an_exposure_jump_is_taken_back(scene: Scene) -> None:
     assert error(places, colours) < 4.0
 
 
+def test_what_one_image_clips_another_may_have_seen(scene: Scene) -> None:
+    for k, gain in enumerate((1.6, *6 * (0.8,))):
+        T = pose(0.04 * k)
+        scene.look((camera_image(photograph(T, gain)), T))
+    places, colours = scene.colours()
+    assert colours.max() > 270.0
+    assert error(places, colours / 1.6) < 4.0
+    exposure = scene.refinement.exposure
+    assert 0.75 < exposure < 0.98
+    mesh, atlas = scene.textured()
+    places, colours = sample(mesh, atlas, np.array((1 / 3, 1 / 3, 1 / 3), np.float32))
+    assert error(places, colours / (1.6 * exposure)) < 4.0
+
+
 def test_a_wrong_first_colour_is_not_defended_for_ever(scene: Scene) -> None:
     wrong = np.full((MODEL.height, MODEL.width, 3), 20, np.uint8)
     wrong[:, ::2] = 24

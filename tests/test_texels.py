@@ -56,6 +56,14 @@ def test_refining_keeps_colours_and_shares_information_out() -> None:
     np.testing.assert_array_equal(new[1::2, 1::2, 3], np.maximum(old[..., 3] // 4, 1))
 
 
+def test_discounted_texels_stay_known() -> None:
+    texels = tx.allocate(1e6)
+    at = texels.chart[tx.add_chart(texels, tx.chart_key(1, 2, 3, 0), 0), tx.AT]
+    texels.texel[at : at + 4, 3] = (0, 5, 160, 65535)
+    tx.discount(texels, 16)
+    assert texels.texel[at : at + 4, 3].tolist() == [0, 1, 10, 4095]
+
+
 def test_a_surface_that_wavers_about_a_border_keeps_its_chart() -> None:
     texels = tx.allocate(1.0)
     chart = tx.add_chart(texels, tx.place_key(2, 4, 5, -1), 0)

@@ -21,12 +21,16 @@ _ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Photo:
-    """A photograph: ``image`` uint8 (h, w, 3) RGB, its camera, and ``T_world_cam`` (4, 4)."""
+    """A photograph: ``image`` uint8 (h, w, 3) RGB, its camera, and ``T_world_cam`` (4, 4).
+
+    ``falloff`` holds the coefficients of the lens's fall-off (``lens.log_falloff``), none where it is not known.
+    """
 
     file: str
     image: U8
     camera: CameraModel
     T_world_cam: F64
+    falloff: tuple[float, ...] = ()
 
 
 def read_photos(path: Path) -> Iterator[Photo]:
@@ -62,11 +66,12 @@ def _photo(folder: Path, entry: Any, where: str) -> Photo:
         fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
         k1, k2, p1, p2, k3 = (float(k) for k in entry["distortion"])
         T_cam_world = np.array(entry["T_cam_world"], np.float64)
-    except (KeyError, TypeError, ValueError):
+        falloff = tuple(float(a) for a in entry.get("falloff", ()))
+    except (AttributeError, KeyError, TypeError, ValueError):
         raise InputError(
             f"{where} is not complete; it needs file, fx, fy, cx, cy, distortion and T_cam_world"
         ) from None
-    numbers = np.array([fx, fy, cx, cy, k1, k2, p1, p2, k3])
+    numbers = np.array([fx, fy, cx, cy, k1, k2, p1, p2, k3, *falloff])
     if not np.isfinite(numbers).all() or fx <= 0.0 or fy <= 0.0:
         raise InputError(f"{where}: the camera's numbers must be finite, fx and fy positive")
     if not _is_pose(T_cam_world):
@@ -74,7 +79,7 @@ def _photo(folder: Path, entry: Any, where: str) -> Photo:
     image = read_image(folder / file)
     height, width = image.shape[:2]
     camera = CameraModel(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-    return Photo(file, image, camera, inverse(T_cam_world))
+    return Photo(file, image, camera, inverse(T_cam_world), falloff)
 
 
 def _is_pose(T: F64) -> bool:

@@ -2,6 +2,10 @@
 
 The map is rendered at each photograph's pose and through its lens. Beside it stands the baseline: the input
 points, coloured by the mean of the images that see them, drawn as splats (``colouring.py``).
+
+The map holds colours without the fall-off of the lenses, photographs have it. So where PHOTOS.json states the
+fall-off of a photograph's lens, the picture is also compared as that camera would have taken it: darkened by the
+fall-off, and clipped where the camera clips.
 """
 
 from __future__ import annotations
@@ -18,9 +22,12 @@ from artemis_edge.evaluate.photos import Photo, count_photos, read_photos
 from artemis_edge.export.atlas import Atlas
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F32, Bool
+from artemis_edge.lens import falloff
 from artemis_edge.opened_map import map_folder, open_map
 from artemis_edge.progress import Report, silent
 from artemis_edge.render import render_coloured
+
+_CLIPPED = 255.0  # as much as a photograph can hold
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,29 +73,48 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True)
+class Compared:
+    """The map's picture, and the same with the fall-off of the photographs' lenses (None: no lens's is known)."""
+
+    plain: Series
+    with_falloff: Series | None
+
+
+@dataclass(frozen=True, slots=True)
 class TextureEvaluation:
     """The map, the baseline (None where the map keeps no points), and both on the pixels that both cover."""
 
-    mesh: Series
+    mesh: Compared
     points: Series | None
-    mesh_in_common: Series | None
+    mesh_in_common: Compared | None
     points_in_common: Series | None
 
     def to_json(self) -> dict[str, Any]:
-        """The JSON object of ``evaluate texture``."""
-        baseline = None
-        if self.points is not None and self.mesh_in_common is not None and self.points_in_common is not None:
-            common = {"mesh": self.mesh_in_common.means(), "points": self.points_in_common.means()}
-            baseline = {**self.points.to_json(), "common": common}
-        return {**self.mesh.to_json(), "points_baseline": baseline}
+        """The JSON object of ``evaluate texture``; ``with_falloff`` is there where a lens's is known."""
+        lens = self.mesh.with_falloff
+        through = {} if lens is None else {"with_falloff": lens.to_json()}
+        return {**self.mesh.plain.to_json(), **through, "points_baseline": self._baseline()}
+
+    def _baseline(self) -> dict[str, Any] | None:
+        if self.points is None or self.mesh_in_common is None or self.points_in_common is None:
+            return None
+        common = {"mesh": self.mesh_in_common.plain.means(), "points": self.points_in_common.means()}
+        lens = self.mesh_in_common.with_falloff
+        if lens is not None:
+            common["mesh_with_falloff"] = lens.means()
+        return {**self.points.to_json(), "common": common}
 
 
-def compare(file: str, photo: Photo, picture: F32, covered: Bool) -> Likeness:
-    """``picture`` float32 (h, w, 3) 0..255 beside the photograph, over the pixels ``covered`` (h, w)."""
+def compare(file: str, photo: Photo, picture: F32, covered: Bool, brightest: float = np.inf) -> Likeness:
+    """``picture`` float32 (h, w, 3) 0..255 beside the photograph, over the pixels ``covered`` (h, w).
+
+    After the gains nothing is brighter than ``brightest``.
+    """
     share = float(covered.mean())
     if share == 0.0:
         return Likeness(file, None, None, None, 0.0)
     levelled = picture * channel_gains(photo.image, picture, covered).astype(np.float32)
+    levelled = np.minimum(levelled, np.float32(brightest))
     return Likeness(
         file,
         psnr_db(photo.image, picture, covered),
@@ -103,29 +129,42 @@ def evaluate_texture(
 ) -> TextureEvaluation:
     """Compare a map with the photographs of PHOTOS.json; raises InputError for photographs of no use."""
     total = count_photos(photos)
-    rows: list[tuple[Likeness, ...]] = []
+    rows: list[tuple[Likeness | None, ...]] = []
     for done, photo in enumerate(read_photos(photos)):
         rows.append(_one(mesh, atlas, splats, photo))
         report(done + 1, total, photo.file)
-    series = [Series(column) for column in zip(*rows, strict=True)]
-    if splats is None:
-        return TextureEvaluation(series[0], None, None, None)
-    return TextureEvaluation(*series)
+    series = [_series(column) for column in zip(*rows, strict=True)]
+    whole, lens, points, both, lens_both, points_both = series
+    assert whole is not None
+    in_common = None if both is None else Compared(both, lens_both)
+    return TextureEvaluation(Compared(whole, lens), points, in_common, points_both)
 
 
-def _one(mesh: Mesh, atlas: Atlas | None, splats: SplatCloud | None, photo: Photo) -> tuple[Likeness, ...]:
+def _series(column: tuple[Likeness | None, ...]) -> Series | None:
+    known = tuple(likeness for likeness in column if likeness is not None)
+    return Series(known) if known else None
+
+
+def _one(
+    mesh: Mesh, atlas: Atlas | None, splats: SplatCloud | None, photo: Photo
+) -> tuple[Likeness | None, ...]:
+    """The map whole, with the fall-off, the points; the same map, with the fall-off, and points in common."""
     seen = render_coloured(mesh, atlas, photo.camera, photo.T_world_cam)
-    whole = compare(photo.file, photo, seen.values, seen.covered)
+    whole = _mesh(photo, seen.values, seen.covered)
     if splats is None:
-        return (whole,)
+        return *whole, None, None, None, None
     picture, drawn = splats.draw(photo.camera, photo.T_world_cam)
     both = seen.covered & drawn
-    return (
-        whole,
-        compare(photo.file, photo, picture, drawn),
-        compare(photo.file, photo, seen.values, both),
-        compare(photo.file, photo, picture, both),
-    )
+    points = compare(photo.file, photo, picture, drawn)
+    return *whole, points, *_mesh(photo, seen.values, both), compare(photo.file, photo, picture, both)
+
+
+def _mesh(photo: Photo, picture: F32, covered: Bool) -> tuple[Likeness, Likeness | None]:
+    plain = compare(photo.file, photo, picture, covered)
+    if not photo.falloff:
+        return plain, None
+    taken = picture * falloff(photo.camera, photo.falloff)[..., None]
+    return plain, compare(photo.file, photo, taken, covered, brightest=_CLIPPED)
 
 
 def run(map_path: Path, photos: Path, report: Report = silent) -> TextureEvaluation:
@@ -137,16 +176,25 @@ def run(map_path: Path, photos: Path, report: Report = silent) -> TextureEvaluat
 
 def to_text(evaluation: TextureEvaluation) -> str:
     """The figures for people."""
-    lines = [f"{len(evaluation.mesh.photos)} photographs", _line("map", evaluation.mesh)]
+    lines = [f"{len(evaluation.mesh.plain.photos)} photographs", *_mesh_lines(evaluation.mesh)]
     if evaluation.points is None:
         lines.append("no baseline: the map keeps no coloured points")
     else:
         lines.append(_line("coloured points", evaluation.points))
     if evaluation.mesh_in_common is not None and evaluation.points_in_common is not None:
         lines.append("on the pixels that both cover:")
-        lines.append(_line("map", evaluation.mesh_in_common))
+        lines += _mesh_lines(evaluation.mesh_in_common)
         lines.append(_line("coloured points", evaluation.points_in_common))
     return "\n".join(lines)
+
+
+def _mesh_lines(mesh: Compared) -> list[str]:
+    lines = [_line("map", mesh.plain)]
+    return (
+        lines
+        if mesh.with_falloff is None
+        else [*lines, _line("map, with the lens's fall-off", mesh.with_falloff)]
+    )
 
 
 def _line(name: str, series: Series) -> str:

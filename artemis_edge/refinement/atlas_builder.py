@@ -54,8 +54,17 @@ class Boxes(NamedTuple):
     at: I64
 
 
-def build_atlas(mesh: Mesh, texels: TexelStore, pages: TexelPages, voxel_m: float, most_texels: int) -> Atlas:
+def build_atlas(
+    mesh: Mesh,
+    texels: TexelStore,
+    pages: TexelPages,
+    voxel_m: float,
+    most_texels: int,
+    exposure: float = 1.0,
+) -> Atlas:
     """Atlas of a mesh from the texture of its map; coarser where it would have more than ``most_texels``.
+
+    Colours are multiplied by ``exposure``.
 
     Texels on disk are brought into memory part by part.
     """
@@ -85,7 +94,7 @@ def build_atlas(mesh: Mesh, texels: TexelStore, pages: TexelPages, voxel_m: floa
     for rows, blocks in parts:
         pages.need(blocks)
         mine = np.unique(place[rows])
-        _fill(texels, faces, boxes, mine[mine >= 0], atlas)
+        _fill(texels, faces, boxes, mine[mine >= 0], atlas, exposure)
     return atlas
 
 
@@ -132,7 +141,7 @@ def _lay_out(faces: Faces, most_texels: int) -> tuple[Boxes, int, int]:
     return Boxes(face, first, last, level.astype(np.int32), start, size, at), page_edge, count
 
 
-def _fill(texels: TexelStore, faces: Faces, boxes: Boxes, mine: I64, atlas: Atlas) -> None:
+def _fill(texels: TexelStore, faces: Faces, boxes: Boxes, mine: I64, atlas: Atlas, exposure: float) -> None:
     """Draw the rectangles ``mine`` and set the corners of their faces."""
     if len(mine) == 0:
         return
@@ -141,7 +150,7 @@ def _fill(texels: TexelStore, faces: Faces, boxes: Boxes, mine: I64, atlas: Atla
     P, E = np.empty((2, 3, 3))
     for g in mine.tolist():
         picture = atlas.pages[boxes.at[g, 0]]
-        fill_box(texels, faces, boxes, g, picture, atlas.page, atlas.uv, known, queue, P, E)
+        fill_box(texels, faces, boxes, g, exposure, picture, atlas.page, atlas.uv, known, queue, P, E)
 
 
 def _page_edge(size: I64) -> int:
@@ -202,6 +211,7 @@ def fill_box(
     faces: Faces,
     boxes: Boxes,
     g: int,
+    exposure: float,
     picture: U8,
     page: I32,
     uv: F32,
@@ -217,7 +227,9 @@ def fill_box(
     known[: width * height] = 0
     total = 0
     for k in range(boxes.first[g], boxes.last[g]):
-        total += _copy_face(texels, faces, boxes.face[k], boxes.level[g], left, top, part, known, P, E)
+        total += _copy_face(
+            texels, faces, boxes.face[k], boxes.level[g], left, top, exposure, part, known, P, E
+        )
     if total == 0:
         return
     _spread(part, known, queue)
@@ -238,6 +250,7 @@ def _copy_face(
     level: int,
     left: int,
     top: int,
+    exposure: float,
     picture: U8,
     known: U8,
     P: F64,
@@ -274,7 +287,7 @@ def _copy_face(
                 continue
             row, column = j - top, i - left
             if known[row * width + column] == 0 and _copy_texel(
-                texels, chart, level, i - b * edge, j - c * edge, picture[row, column]
+                texels, chart, level, i - b * edge, j - c * edge, exposure, picture[row, column]
             ):
                 known[row * width + column] = 1
                 total += 1
@@ -282,7 +295,7 @@ def _copy_face(
 
 
 @kernel
-def _copy_texel(texels: TexelStore, chart: int, level: int, i: int, j: int, out: U8) -> bool:
+def _copy_texel(texels: TexelStore, chart: int, level: int, i: int, j: int, exposure: float, out: U8) -> bool:
     """Colour of a texel at ``level`` of a chart that may be finer or coarser; False where no camera saw it."""
     own, at = texels.chart[chart, LEVEL], texels.chart[chart, AT]
     edge = COARSEST << own
@@ -292,7 +305,7 @@ def _copy_texel(texels: TexelStore, chart: int, level: int, i: int, j: int, out:
         if texel[3] == 0:
             return False
         for k in range(3):
-            out[k] = int(min(texel[k] / MEAN_SCALE + 0.5, 255.0))
+            out[k] = int(min(texel[k] * exposure / MEAN_SCALE + 0.5, 255.0))
         return True
     shift = own - level
     red = green = blue = 0.0
@@ -305,7 +318,7 @@ def _copy_texel(texels: TexelStore, chart: int, level: int, i: int, j: int, out:
                 n += 1
     if n == 0:
         return False
-    scale = 1.0 / (n * MEAN_SCALE)
+    scale = exposure / (n * MEAN_SCALE)
     out[0] = int(min(red * scale + 0.5, 255.0))
     out[1] = int(min(green * scale + 0.5, 255.0))
     out[2] = int(min(blue * scale + 0.5, 255.0))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from artemis_edge.frames import F32, F64, I64, CameraModel
+from artemis_edge.lens import corner_radius2, log_falloff
 from artemis_edge.refinement.reliability import Observations
 
 # Of the vertices every so-manieth by its slot, the same ones in each image; about 1500 of a view
@@ -50,9 +51,9 @@ class Exposures:
         self._radius2.append(radius2(model, seen.pixel[rows]))
         self._camera.append(self._cameras.setdefault(name, len(self._cameras)))
 
-    def solve(self) -> tuple[F32, dict[str, F32]]:
-        """Gain of each image to a common exposure, float32 (n, 3), and each camera's table of ``SHADES`` factors
-        that undo its lens's fall-off.
+    def solve(self) -> tuple[F32, dict[str, F64]]:
+        """Gain of each image to a common exposure, float32 (n, 3), and the fall-off of each camera's lens, float64
+        (``_POWERS``,), as ``lens.log_falloff`` takes it.
         """
         n = len(self)
         place = np.unique(np.concatenate(self._slot), return_inverse=True)[1]
@@ -68,12 +69,12 @@ class Exposures:
             falloff = _falloff(place, image, colour.mean(axis=1), r2, camera, len(self._cameras), n)
         colour -= _shade(falloff[camera], r2)[:, None]
         gain = np.stack([_gains(place, image, colour[:, k], n) for k in range(3)], axis=1)
-        steps = np.linspace(0.0, 1.0, SHADES)
-        tables = {
-            name: np.exp(-_shade(falloff[k][None], steps)).astype(np.float32)
-            for name, k in self._cameras.items()
-        }
-        return np.exp(gain).astype(np.float32), tables
+        return np.exp(gain).astype(np.float32), {name: falloff[k] for name, k in self._cameras.items()}
+
+
+def undoing(falloff: F64) -> F32:
+    """Table of ``SHADES`` factors that undo a fall-off, over the squared distance from the principal point."""
+    return np.exp(-log_falloff(falloff, np.linspace(0.0, 1.0, SHADES))).astype(np.float32)
 
 
 def radius2(model: CameraModel, pixel: F32) -> F64:
@@ -81,13 +82,6 @@ def radius2(model: CameraModel, pixel: F32) -> F64:
     away: F64 = (np.asarray(pixel, np.float64) - (model.cx, model.cy)) ** 2
     total: F64 = away.sum(axis=1) / corner_radius2(model)
     return total
-
-
-def corner_radius2(model: CameraModel) -> float:
-    """Squared distance of the farthest corner from the principal point [pixels^2]."""
-    x = max(model.cx, model.width - model.cx)
-    y = max(model.cy, model.height - model.cy)
-    return float(x * x + y * y)
 
 
 def _power_of_two(n: int) -> int:

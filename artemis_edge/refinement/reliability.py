@@ -27,7 +27,7 @@ _DEPTH_REACH = 1.5
 # Surfaces so steep that they change by more than this share of their distance within that reach hide themselves
 _STEEPEST = 0.3
 # Levels from which a channel is clipped, and below which a pixel is lost in the dark, with what they weigh then
-CLIPPED, _CLIPPED_WEIGHT = 250.0, 0.1
+CLIPPED, CLIPPED_WEIGHT = 250.0, 0.1
 _BLACK, _BLACK_WEIGHT = 4.0, 0.3
 
 
@@ -62,7 +62,8 @@ class Observations(NamedTuple):
 
     ``slot`` int32 cell slots, ``pixel`` float32 (n, 2) u, v, ``depth`` [m] along z, ``cosine`` of the viewing
     angle, ``colour`` float32 (n, 3) after the gain, ``geometric`` the part of W without r_photo, ``reliability``
-    the W of eq. 9, which may be smaller: who takes an observation asks for ``Trust.least`` of it too.
+    the W of eq. 9, which may be smaller: who takes an observation asks for ``Trust.least`` of it too. ``level`` is
+    the :func:`exposure_weight` of the pixel as the camera gave it.
     """
 
     slot: I32
@@ -72,6 +73,7 @@ class Observations(NamedTuple):
     colour: F32
     geometric: F32
     reliability: F32
+    level: F32
 
 
 @kernel
@@ -144,16 +146,16 @@ def shade_at(photo: Photo, u: float, v: float) -> float:
 
 @kernel
 def exposure_weight(r: float, g: float, b: float) -> float:
-    """How much a pixel tells by its level: a clipped channel tells only that it was at least that bright."""
+    """How much a pixel tells by its level as the camera gave it: a clipped channel tells only a lower bound."""
     brightest = max(r, g, b)
     if brightest >= CLIPPED:
-        return _CLIPPED_WEIGHT
+        return CLIPPED_WEIGHT
     return _BLACK_WEIGHT if brightest <= _BLACK else 1.0
 
 
 def new_observations(n: int) -> Observations:
     """Room for ``n`` rows."""
-    scalar = np.empty((4, n), np.float32)
+    scalar = np.empty((5, n), np.float32)
     return Observations(
         np.empty(n, np.int32),
         np.empty((n, 2), np.float32),
@@ -162,6 +164,7 @@ def new_observations(n: int) -> Observations:
         np.empty((n, 3), np.float32),
         scalar[2],
         scalar[3],
+        scalar[4],
     )
 
 
@@ -180,6 +183,7 @@ def observe(store: Store, visible: Visible, photo: Photo, trust: Trust) -> Obser
         out.colour[:n],
         out.geometric[:n],
         out.reliability[:n],
+        out.level[:n],
     )
 
 
@@ -206,7 +210,7 @@ def observe_vertices(store: Store, visible: Visible, photo: Photo, trust: Trust,
         out.slot[n], out.pixel[n, 0], out.pixel[n, 1] = s, u, v
         out.depth[n], out.cosine[n] = p[2], cosine
         out.colour[n, 0], out.colour[n, 1], out.colour[n, 2] = r, k, b
-        out.geometric[n] = g
+        out.geometric[n], out.level[n] = g, exposure_weight(r, k, b)
         n += 1
     return n
 

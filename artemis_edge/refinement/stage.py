@@ -12,10 +12,11 @@ from artemis_edge.config import RefinementConfig
 from artemis_edge.export.atlas import Atlas
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F32, F64, CameraImage, TrackedFrame
+from artemis_edge.lens import log_falloff
 from artemis_edge.refinement import texels as tx
 from artemis_edge.refinement.atlas_builder import build_atlas
-from artemis_edge.refinement.colours import update_vertices
-from artemis_edge.refinement.exposure import Exposures
+from artemis_edge.refinement.colours import exposure_of, update_vertices
+from artemis_edge.refinement.exposure import SHADES, Exposures, undoing
 from artemis_edge.refinement.painting import new_brush, paint
 from artemis_edge.refinement.photographs import Keyframes, Refused, Waiting, arrivals, decode
 from artemis_edge.refinement.reliability import Trust, new_observations
@@ -29,6 +30,8 @@ _EVERYTHING = 1 << 16  # more than any texel's information as stored
 _LEARNT = (4, 8, 16, 32)  # keyframes after which the lenses' fall-off is found
 _LITTLE = 0.25  # good observations, below which keyframes are asked again
 _PARTS = 64  # of the surface, by which ``share`` is told
+# Change of a lens's fall-off, in logarithm, from which on colours taken with the old one must give way, and by how much
+_NOTABLE, _GIVE_WAY = 0.05, 16
 
 
 def trust_of(config: RefinementConfig) -> Trust:
@@ -67,6 +70,7 @@ class Refinement:
         self._looks = 0
         self._in_view = 0.0
         self._exposures = Exposures(config.vignetting)
+        self._falloff: dict[str, F64] = {}
         self._shades: dict[str, F32] = {}
 
     def update(self, frame: TrackedFrame, stamp: int) -> None:
@@ -92,10 +96,16 @@ class Refinement:
         for k in range(before):
             self._fuse(self.keyframes.get(k), unseen)
 
+    @property
+    def exposure(self) -> float:
+        """Factor on all colours of the finished map that brings what is brighter than 255 into range."""
+        return exposure_of(self._map.store)
+
     def atlas(self, mesh: Mesh) -> Atlas:
         """The texture of the finished mesh."""
         most = int(self._config.atlas_megatexels * 1e6)
-        return build_atlas(mesh, self.texels, self.pages, self._map.config.voxel_m, most)
+        voxel_m = self._map.config.voxel_m
+        return build_atlas(mesh, self.texels, self.pages, voxel_m, most, self.exposure)
 
     def close(self) -> None:
         """Remove the files of this run."""
@@ -107,6 +117,11 @@ class Refinement:
         """Images and texels that could not be used, by reason."""
         refused = int(self.texels.counter[tx.REFUSED])
         return {**self.refused.count, **({"texels_without_memory": refused} if refused else {})}
+
+    @property
+    def falloff(self) -> Mapping[str, F64]:
+        """Of each camera whose lens's fall-off was found, its coefficients (``lens.log_falloff``)."""
+        return self._falloff
 
     def _is_due(self, waiting: Waiting, stamp: int) -> bool:
         age = stamp - waiting.stamp
@@ -129,15 +144,24 @@ class Refinement:
             exposures.add(waiting.image.name, model, seen)
         if len(exposures) == 0:
             return np.empty((0, 3), np.float32)
-        gains, self._shades = exposures.solve()
+        gains, falloff = exposures.solve()
+        self._set_falloff(falloff)
         return gains
+
+    def _set_falloff(self, falloff: dict[str, F64]) -> None:
+        steps = np.linspace(0.0, 1.0, SHADES)
+        change = [log_falloff(a - self._falloff.get(name, 0.0 * a), steps) for name, a in falloff.items()]
+        if self._looks > 0 and max(float(np.abs(c).max()) for c in change) > _NOTABLE:
+            tx.discount(self.texels, _GIVE_WAY)
+        self._falloff = falloff
+        self._shades = {name: undoing(a) for name, a in falloff.items()}
 
     def _learn(self, waiting: Waiting, view: View) -> None:
         """Keep what a keyframe says of exposures; from time to time find the lenses' fall-off anew."""
         if self._config.vignetting and len(self._exposures) < _LEARNT[-1]:
             self._exposures.add(waiting.image.name, waiting.image.model, view.seen)
             if len(self._exposures) in _LEARNT:
-                self._shades = self._exposures.solve()[1]
+                self._set_falloff(self._exposures.solve()[1])
 
     def _fuse(self, waiting: Waiting, enough: int, gain: F32 | None = None, learn: bool = False) -> None:
         pixels = decode(waiting.image, self.refused)

@@ -4,7 +4,7 @@ A chart is one face of one voxel: texels in a square grid parallel to two axes, 
 the surface belongs to the chart of its voxel in the direction its triangle faces, so that meshing a voxel anew
 leaves its texture where it is, and the texels of neighbouring charts continue each other.
 
-Each texel carries the Gaussian colour state of section III-C: mean in units of 1/256 grey level, and information
+Each texel carries the Gaussian colour state of section III-C: mean in units of 1/64 grey level, and information
 (how many good observations it is worth).
 """
 
@@ -23,7 +23,9 @@ from artemis_edge.frames import I32, I64
 LEVELS = 4
 COARSEST = 8  # texels along the edge of a chart of level 0; each level has twice as many
 DIRECTIONS = 6  # +x, +y, +z, -x, -y, -z: where the surface faces
-MEAN_SCALE = 256.0
+# Steps of a mean per grey level. A place may be brighter than 255 in the map's exposure, which is that of an image
+# that another one, darker, did not clip: uint16 holds 1023 levels
+MEAN_SCALE = 64.0
 INFORMATION_SCALE = 1024.0
 # Columns of TexelStore.chart
 AT, LEVEL, LOOKS, STAMP = range(4)
@@ -164,6 +166,13 @@ def refine_chart(texels: TexelStore, chart: int, level: int) -> bool:
     _give_room(texels, old_at, old_level)
     row[AT], row[LEVEL] = at, level
     return True
+
+
+def discount(texels: TexelStore, by: int) -> None:
+    """Divide the information of all texels in memory by ``by``: what comes next outweighs them."""
+    used = texels.texel[: int(texels.counter[N_TEXELS]), 3]
+    known = used > 0
+    used[known] = np.maximum(used[known] // np.uint16(by), 1)
 
 
 @kernel

@@ -8,9 +8,10 @@ import numpy as np
 
 from artemis_edge.block_store import Store
 from artemis_edge.frames import F32, F64, U8, CameraModel
+from artemis_edge.lens import corner_radius2
 from artemis_edge.refinement.camera import Camera, make_camera, view_bounds
 from artemis_edge.refinement.colours import estimate_gain
-from artemis_edge.refinement.exposure import SHADES, corner_radius2
+from artemis_edge.refinement.exposure import SHADES
 from artemis_edge.refinement.reliability import Observations, Photo, Trust, observe, weigh
 from artemis_edge.refinement.visible import Visible, depth_map, list_visible, new_visible, unmeshed
 

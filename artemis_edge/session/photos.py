@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -105,10 +105,13 @@ class HeldOut:
             folder.rmdir()
         (self.out / INDEX).unlink()
 
-    def write_index(self, path: Path, trajectory: Trajectory) -> int:
+    def write_index(
+        self, path: Path, trajectory: Trajectory, falloff: Mapping[str, F64] | None = None
+    ) -> int:
         """Write PHOTOS.json; returns how many photographs have no pose and are not in it.
 
-        The pose of a photograph is the odometry's at the middle of its exposure, else interpolated there.
+        The pose of a photograph is the odometry's at the middle of its exposure, else interpolated there. An entry
+        has ``falloff`` where that of its camera's lens is known.
         """
         stamps = np.array([photo.image.stamp_ns for photo in self._photos], np.int64)
         known = covered(trajectory, stamps)
@@ -118,9 +121,14 @@ class HeldOut:
             T = self._poses.get((photo.image.name, photo.image.stamp_ns), poses[k] if known[k] else None)
             known[k] = T is not None
             if T is not None:
-                content.append(photo_entry(photo.file, photo.image, T))
+                known_of_lens = {} if falloff is None else _falloff(falloff.get(photo.image.name))
+                content.append(photo_entry(photo.file, photo.image, T) | known_of_lens)
         write_bytes(path, (json.dumps({"photos": content}, indent=1) + "\n").encode())
         return int(np.count_nonzero(~known))
+
+
+def _falloff(coefficients: F64 | None) -> dict[str, Any]:
+    return {} if coefficients is None else {"falloff": [round(float(a), 6) for a in coefficients]}
 
 
 def suffix_of(encoded: bytes) -> str:
