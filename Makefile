@@ -8,7 +8,7 @@ LEARNT ?= train-out
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint bench soak ablation viewer-test train install-service clean
+.PHONY: help setup demo test lint bench soak ablation viewer-test terminal-test cluster-test train install-service clean
 
 help:
 	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
@@ -17,6 +17,8 @@ help:
 	@echo "make bench   what a frame costs on this machine"
 	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
 	@echo "make viewer-test  GLB and browser view in headless Chromium (fetches three.js with npm)"
+	@echo "make terminal-test  demo --tui in tmux at 80x24 and 160x48, from its start to its report (some minutes)"
+	@echo "make cluster-test  four recordings on two Dask workers, one of which is killed (a minute or two)"
 	@echo "make train   render views of the virtual worlds, train and export the shipped network (an hour or two, torch)"
 	@echo "make install-service   as root: the systemd service and what belongs to it (docs/operator.md)"
 	@echo "make ablation  the paper's ablations (Tables III and IV) on a virtual world"
@@ -55,6 +57,14 @@ viewer-test: $(READY)
 	@command -v npm >/dev/null || { echo "npm is needed: on Debian and Ubuntu: apt install npm chromium"; exit 2; }
 	@cd tests/viewer && npm install --no-audit --no-fund --no-package-lock --silent
 	@ARTEMIS_VIEWER=1 $(BIN)/python -m pytest tests/viewer
+
+terminal-test: $(READY)
+	@command -v tmux >/dev/null || { echo "tmux is needed: on Debian and Ubuntu: apt install tmux"; exit 2; }
+	@ARTEMIS_TERMINAL=1 $(BIN)/python -m pytest tests/soak/test_demo_terminal.py
+
+cluster-test: $(READY)
+	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install -qq --only-binary :all: -e '.[dev,cluster]'
+	@ARTEMIS_CLUSTER=1 $(BIN)/python -m pytest tests/soak/test_cluster.py
 
 # Seeds: learnt from, calibrated with, judged by. Worlds that are used otherwise have seeds far below these.
 train: $(READY)

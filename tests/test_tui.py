@@ -1,9 +1,7 @@
 """The terminal: pages by pilot, pictures by hand, and a whole session against a remote that is told what to say."""
 
-import asyncio
 import multiprocessing
 import threading
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,122 +15,22 @@ from artemis_edge import check
 from artemis_edge.check_finding import Finding
 from artemis_edge.commands.tui import read_keys
 from artemis_edge.errors import InputError
-from artemis_edge.frames import MeshDelta
 from artemis_edge.newest import Newest, joined
-from artemis_edge.status import MapStatus, QueryStatus, Status, Stream, SyncStatus
+from artemis_edge.status import QueryStatus, Status
+from artemis_edge.tui import app as app_module
+from artemis_edge.tui import jobs, pages
 from artemis_edge.tui.app import ArtemisTui, LivePage
 from artemis_edge.tui.child import Teller
 from artemis_edge.tui.history import History
+from artemis_edge.tui.jobs import Job
 from artemis_edge.tui.live_questions import LiveQuestions
-from artemis_edge.tui.pages import recordings
+from artemis_edge.tui.pages import ReportPlace, SessionsPage, recordings
 from artemis_edge.tui.picture import SKY, MapCopy, draw, found_in, luminance_text
 from artemis_edge.tui.remote import RemoteError
 from artemis_edge.tui.socket_remote import SocketRemote
 from artemis_edge.tui.widgets import MeshPicture, advice, frame_times, gauges
-
-FULL = Status(
-    state="recording",
-    seconds=83.4,
-    frames=834,
-    dropped=2,
-    streams=[
-        Stream("lidar_0", 240_000, 240_000, 0, state="running"),
-        Stream("cam_0", 6.0, 10.0, 3, state="running"),
-        Stream("imu", 0.0, 400.0, 0, state="silent", message="no data for 2 s: plug it in again"),
-    ],
-    sync=SyncStatus("locked", 0.12, {"imu": 18.0}),
-    map=MapStatus(120_000, 200_000, 812.0, 640.0),
-    frame_ms=[20.0, 60.0, 80.0, 130.0],
-    disk_minutes=12.0,
-    battery_minutes=4.0,
-    degenerate=True,
-    coaching=["turn slower"],
-    losses={"packets": 3},
-    queries=[
-        QueryStatus("bench", "matched", 2, 0.91, (255, 0, 0), places=[(1.0, 2.0, 0.0), (5.0, 5.0, 0.0)]),
-        QueryStatus("unicorn", "unsupported", note="no model knows it", colour=(0, 255, 0)),
-    ],
-    overload=["preview"],
-)
-
-
-def delta(block: tuple[int, int, int], points: np.ndarray, label: int = 0, index: int = 0) -> MeshDelta:
-    n = len(points)
-    return MeshDelta(
-        index=index,
-        block=np.array([block], np.int32),
-        vertex_start=np.array([0, n]),
-        triangle_start=np.array([0, 1]),
-        vertex_id=np.arange(n),
-        position=np.asarray(points, np.float32),
-        normal=np.tile(np.array([0, 0, 1], np.float32), (n, 1)),
-        colour=np.full((n, 3), 200, np.uint8),
-        label=np.full(n, label, np.uint8),
-        confidence=np.ones(n, np.float32),
-        triangles=np.array([[0, 1, 2]]),
-    )
-
-
-class Fake:
-    """A remote that says what it is given and remembers what it was told."""
-
-    name = "test"
-
-    def __init__(self, status: Status = FULL) -> None:
-        self.now = status
-        self.news = [delta((0, 0, 0), np.random.default_rng(1).uniform(-5, 5, (3000, 3)), 1)]
-        self.told: list[str] = []
-        self.fault = ""
-
-    def status(self) -> Status:
-        if self.fault:
-            raise RemoteError(self.fault)
-        return self.now
-
-    def deltas(self) -> list[MeshDelta]:
-        news, self.news = self.news, []
-        return news
-
-    def ask(self, text: str) -> str:
-        self.told.append(f"ask {text}")
-        return f"looking for '{text}'"
-
-    def forget(self, text: str) -> str:
-        self.told.append(f"forget {text}")
-        return ""
-
-    def command(self, name: str) -> str:
-        self.told.append(name)
-        return name
-
-    def close(self) -> None:
-        self.told.append("close")
-
-
-def run(
-    app: ArtemisTui, script: Callable[[Pilot[None]], Awaitable[None]], size: tuple[int, int] = (80, 24)
-) -> None:
-    async def all_of_it() -> None:
-        async with app.run_test(size=size) as pilot:
-            await pilot.pause(0.6)
-            await script(pilot)
-
-    asyncio.run(all_of_it())
-
-
-async def settled(pilot: Pilot[None], true: Callable[[], bool]) -> None:
-    """Wait until something holds: what threads do is not counted in steps."""
-    for _ in range(100):
-        if true():
-            return
-        await pilot.pause(0.05)
-    raise AssertionError("it never came to that")
-
-
-def live(app: ArtemisTui) -> LivePage:
-    page = app.get_screen("live")
-    assert isinstance(page, LivePage)
-    return page
+from tests.fake_remote import FULL, Fake, delta, live, run, settled
+from tests.waiting import until
 
 
 @pytest.mark.parametrize("size", [(80, 24), (160, 48)])
@@ -213,11 +111,62 @@ def test_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         card = app.screen.query_one("#card", Static)
         await settled(pilot, lambda: "session.mcap" in str(card.render()) or "MCAP" in str(card.render()))
         await pilot.press("question_mark")
-        assert "Walking" in app.export_screenshot()
+        assert "Watch&#160;the&#160;picture" in app.export_screenshot()
         await pilot.press("1")
         assert isinstance(app.screen, LivePage)
 
     run(app, script)
+
+
+class FakeJob:
+    def __init__(self, label: str, words: list[str], out: Path) -> None:
+        self.words, self.out, self.over, self.sentence, self.report = words, out, False, f"{label}: busy", ""
+
+    def stop(self) -> None:
+        self.over, self.sentence, self.report = True, "stopped", str(self.out / "report.html")
+
+    def close(self) -> None:
+        self.stop()
+
+
+def test_a_recording_is_mapped_from_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "Job", FakeJob)
+    monkeypatch.setattr(app_module, "can_open", lambda: False)
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "session.mcap").write_bytes(b"no recording")
+    app = ArtemisTui(Fake(), tmp_path)
+
+    async def script(pilot: Pilot[None]) -> None:
+        await pilot.press("3", "f", "p")
+        page = app.screen
+        assert isinstance(page, SessionsPage) and isinstance(page.job, FakeJob)
+        out = str(tmp_path / "walk" / "reprocess")
+        profile = page.job.words[-1]
+        assert page.job.words == ["reprocess", str(tmp_path / "walk"), "--out", out, "--profile", profile]
+        assert "busy" in str(page.query_one("#job", Static).render())
+        first = page.job
+        await pilot.press("y")
+        assert page.job is first, "one at a time"
+        await pilot.press("x", "o")
+        await pilot.pause()
+        assert isinstance(app.screen, ReportPlace) and f"{out}/report.html" in str(
+            app.screen.query_one(Static).render()
+        )
+        await pilot.press("escape", "y")
+        await pilot.pause()
+        assert page.job is not first and page.job.words[0] == "replay"
+
+    run(app, script)
+
+
+def test_a_job_tells_how_it_does(tmp_path: Path) -> None:
+    job = Job("reprocess walk", ["reprocess", str(tmp_path / "walk"), "--out", str(tmp_path)], tmp_path)
+    assert until(lambda: job.over, 60.0)
+    assert job.sentence.startswith(f"reprocess walk: there is no {tmp_path / 'walk'};") and job.report == ""
+    job.close()
+    assert jobs._bar("replay a", 3, 12) == "replay a: [######..................] 3 of 12"
+    assert jobs._PROGRESS.match("mapping walk: 3 of 12, 40 ms a frame")
+    assert jobs._PROGRESS.match("note: an image of the first 3 is damaged") is None
 
 
 def test_a_remote_that_goes_and_comes_back(tmp_path: Path) -> None:
@@ -239,6 +188,7 @@ def test_the_report_opens_when_there_is_one(tmp_path: Path, monkeypatch: pytest.
     app = ArtemisTui(remote, tmp_path)
     opened: list[str] = []
     monkeypatch.setattr(app, "open_url", lambda url, **_: opened.append(url))
+    monkeypatch.setattr(app_module, "can_open", lambda: True)
 
     async def script(pilot: Pilot[None]) -> None:
         await pilot.press("o")
@@ -249,6 +199,17 @@ def test_the_report_opens_when_there_is_one(tmp_path: Path, monkeypatch: pytest.
         assert opened == [(tmp_path / "report.html").resolve().as_uri()]
 
     run(app, script)
+
+
+def test_only_a_desktop_opens_browsers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SSH_CONNECTION", "SSH_TTY"):
+        monkeypatch.delenv(name, raising=False)
+    assert not app_module.can_open(), "a computer without a screen"
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert app_module.can_open()
+    monkeypatch.setenv("SSH_TTY", "/dev/pts/3")
+    assert not app_module.can_open(), "a text browser would take the terminal"
 
 
 # --- the parts

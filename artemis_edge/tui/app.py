@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
@@ -21,7 +23,7 @@ from textual.widgets import DataTable, Footer, Header, Input, Static
 
 from artemis_edge.status import Status
 from artemis_edge.tui.history import History
-from artemis_edge.tui.pages import ChecksPage, HelpPage, SessionsPage
+from artemis_edge.tui.pages import ChecksPage, HelpPage, ReportPlace, SessionsPage
 from artemis_edge.tui.picture import Kind, MapCopy, draw, found_in
 from artemis_edge.tui.remote import Remote, RemoteError
 from artemis_edge.tui.widgets import Advice, FrameTimes, Gauges, MeshPicture, Queries, Streams
@@ -32,7 +34,15 @@ _WORDS = (
     "backpack", "bench", "bicycle", "building", "car", "chair", "cyclist", "door", "ground", "person",
     "person next to the bench", "red car", "tallest tree", "tree", "truck",
 )  # fmt: skip
+_WHITE = (255, 255, 255)
 _NEAREST_M, _FARTHEST_M = 10.0, 320.0
+
+
+def can_open() -> bool:
+    """Whether this terminal is on a desktop: over SSH, or without a display, nobody would see what opens."""
+    if any(os.environ.get(name) for name in ("SSH_CONNECTION", "SSH_TTY")):
+        return False
+    return sys.platform == "darwin" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 class LivePage(Screen[None]):
@@ -42,7 +52,8 @@ class LivePage(Screen[None]):
         Binding("r", "command('start')", "start", id="start"),
         Binding("s", "command('stop')", "stop", id="stop"),
         Binding("m", "command('mark')", "mark", id="mark"),
-        Binding("slash", "ask", "ask", id="ask", key_display="/"),
+        # priority: what is written right after it must find the line ready
+        Binding("slash", "ask", "ask", id="ask", key_display="/", priority=True),
         Binding("v", "view", "view", id="view"),
         Binding("plus,equals_sign", "zoom(0.7)", "nearer", show=False, id="nearer"),
         Binding("minus", "zoom(1.4)", "farther", show=False, id="farther"),
@@ -50,8 +61,8 @@ class LivePage(Screen[None]):
         Binding("escape", "leave", "", show=False, id="leave"),
     ]
     CSS = """
-    #left { width: 3fr; } #right { width: 2fr; min-width: 30; }
-    Gauges { height: 2; } FrameTimes { height: 1; } Advice { height: auto; max-height: 4; }
+    #left { width: 3fr; } #right { width: 2fr; min-width: 36; padding: 0 0 0 1; }
+    Gauges { height: 2; } FrameTimes { height: 1; } Advice { height: auto; max-height: 6; }
     Streams { height: auto; max-height: 8; } Queries { height: 1fr; min-height: 4; }
     Input { height: 1; border: none; padding: 0; } #prompt { height: 1; }
     """
@@ -83,16 +94,19 @@ class LivePage(Screen[None]):
             compact=True,
             id="ask",
         )
-        yield Footer()
+        yield Footer(show_command_palette=False, compact=True)
 
     def on_mount(self) -> None:
         """The picture is drawn on a timer of its own."""
-        self.query_one(Queries).focus()
+        self.set_focus(self.query_one(Queries))
         self.set_interval(PICTURE_EVERY_S, self.redraw)
 
     def show(self, status: Status) -> None:
         """Take over a new status."""
-        status = replace(status, queries=[found_in(self._copy, q) for q in status.queries])
+        queries = [found_in(self._copy, q) for q in status.queries]
+        if status.state in ("done", "idle"):  # nobody is looking any more
+            queries = [replace(q, status="not found") if q.status == "searching" else q for q in queries]
+        status = replace(status, queries=queries)
         self._status = status
         self.query_one(Gauges).show(status)
         self.query_one(FrameTimes).show(status)
@@ -107,7 +121,11 @@ class LivePage(Screen[None]):
             return
         width, height = picture.pixels
         at = self._look_at or self._status.position
-        colours = {label: q.colour for q in self._status.queries for label in q.labels}
+        # without colour what is asked for is bright, all else steps back
+        colours = {
+            label: q.colour if self._colour else _WHITE for q in self._status.queries for label in q.labels
+        }
+        picture.message = "" if len(self._copy) else self._status.message or "no map yet"
         picture.caption = f"{'from above' if self.view == 'above' else 'from behind'}, {self.span_m:.0f} m"
         picture.show(draw(self._copy, width, height, at, self._status.yaw, self.view, self.span_m, colours))
 
@@ -123,12 +141,12 @@ class LivePage(Screen[None]):
 
     def action_ask(self) -> None:
         """To the query line."""
-        self.query_one(Input).focus()
+        self.set_focus(self.query_one(Input))
 
     def action_leave(self) -> None:
         """Away from the query line, or from an object back to oneself."""
         self._look_at = None
-        self.query_one(Queries).focus()
+        self.set_focus(self.query_one(Queries))
         self.redraw()
 
     def action_command(self, name: str) -> None:
@@ -150,7 +168,7 @@ class LivePage(Screen[None]):
         if text:
             self._history.add(text)
             self._call(lambda remote: remote.ask(text))
-        self.query_one(Queries).focus()
+        self.set_focus(self.query_one(Queries))
 
     @on(DataTable.RowSelected, "#queries")
     def jump(self, event: DataTable.RowSelected) -> None:
@@ -225,14 +243,33 @@ class ArtemisTui(App[None]):
     def action_page(self, name: str) -> None:
         """Show another page."""
         self.switch_screen(name)
+        self.refresh_bindings()
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """The page one is on needs no key, so that the others have room."""
+        if action != "page" or not parameters or not self.is_screen_installed("live"):
+            return True
+        return self.screen is not self.get_screen(str(parameters[0]))
 
     def action_report(self) -> None:
         """Open the report of the last run, where there is one."""
-        if not self.status.report:
+        report = self._report()
+        if not report:
             self.notify("there is no report yet: it is written when the map is saved")
             return
-        self.open_url(Path(self.status.report).resolve().as_uri())
-        self.notify(f"report: {self.status.report}")
+        path = Path(report).resolve()
+        if can_open():
+            self.open_url(path.as_uri())
+            self.notify(f"report: {path}")
+        else:  # a browser that opens in this terminal would take it from us
+            self.copy_to_clipboard(str(path))
+            self.push_screen(ReportPlace(path))
+
+    def _report(self) -> str:
+        """Of what was mapped on the page of recordings, else of the last run."""
+        page = self.screen
+        job = page.job if isinstance(page, SessionsPage) else None
+        return (job.report if job is not None else "") or self.status.report
 
     @work(thread=True, exclusive=True, group="poll")
     def poll(self) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import numpy as np
 from rich.segment import Segment
 from rich.style import Style
@@ -10,6 +12,7 @@ from textual.app import RenderResult
 from textual.strip import Strip
 from textual.widget import Widget
 from textual.widgets import DataTable, Static
+from textual.widgets.data_table import ColumnKey
 
 from artemis_edge.frames import U8
 from artemis_edge.status import QueryStatus, Status
@@ -18,6 +21,7 @@ from artemis_edge.tui.picture import luminance_text
 BUDGET_MS = 100.0  # a frame of a LiDAR at 10 Hz
 _BARS = "▁▂▃▄▅▆▇█"
 _HALF = "▀"
+_WIDE = 45  # characters of a table that has room for reasons
 _LOW_MINUTES, _LEAST_MINUTES = 15.0, 5.0
 
 
@@ -31,6 +35,7 @@ class MeshPicture(Widget):
         self._colour = colour
         self._lines: list[Strip] = []
         self.caption = ""
+        self.message = ""
 
     @property
     def pixels(self) -> tuple[int, int]:
@@ -51,8 +56,17 @@ class MeshPicture(Widget):
             return Strip([Segment(f" {self.caption} ", Style(bold=True, reverse=True))]).adjust_cell_length(
                 self.size.width
             )
+        if self.message and (told := self._told(y)):
+            style = Style(color="white", bold=True)
+            return Strip([Segment(told.center(self.size.width), style)]).adjust_cell_length(self.size.width)
         line = self._lines[y] if y < len(self._lines) else Strip.blank(self.size.width)
         return line.adjust_cell_length(self.size.width)
+
+    def _told(self, y: int) -> str:
+        """The line of the message at ``y``: it stands in the middle."""
+        lines = textwrap.wrap(self.message, max(self.size.width - 4, 10))
+        row = y - (self.size.height - len(lines)) // 2
+        return lines[row] if 0 <= row < len(lines) else ""
 
 
 def _strip(top: U8, bottom: U8) -> Strip:
@@ -100,15 +114,18 @@ def frame_times(times: list[float], width: int) -> Text:
 
 
 class Streams(DataTable[Text]):
-    """One row a sensor: rate, losses, state."""
+    """One row a sensor: rate, losses, state; what is wrong is told below (``Advice``)."""
+
+    DEFAULT_CSS = "Streams { overflow-x: hidden; }"
 
     def on_mount(self) -> None:
-        """Columns."""
+        """Columns: 35 characters, what is left of 80 beside the picture."""
         self.cursor_type = "none"
         self.show_cursor = False
         self.zebra_stripes = False
-        for title in ("sensor", "Hz", "lost", "state"):
-            self.add_column(title, key=title)
+        self.cell_padding = 0
+        for title, width in (("sensor", 10), ("Hz", 11), ("lost", 6), ("state", 8)):
+            self.add_column(title, key=title, width=width)
 
     def show(self, status: Status) -> None:
         """Redraw for a status."""
@@ -119,20 +136,41 @@ class Streams(DataTable[Text]):
             style = "bold red" if bad else "yellow" if slow or s.lost else "green"
             self.add_row(
                 Text(s.name),
-                Text(f"{s.hz:.0f}/{s.expected_hz:.0f}" if s.expected_hz else f"{s.hz:.0f}", style=style),
-                Text(str(s.lost), style="yellow" if s.lost else "dim"),
-                Text(s.message or s.state, style=style),
+                Text(f"{short(s.hz)}/{short(s.expected_hz)}" if s.expected_hz else short(s.hz), style=style),
+                Text(short(s.lost), style="yellow" if s.lost else "dim"),
+                Text(s.state, style=style),
             )
+
+
+def short(number: float) -> str:
+    """At most five characters: 240000 as 240k."""
+    for unit, value in (("", number), ("k", number / 1e3), ("M", number / 1e6)):
+        if value < 9999.5 or unit == "M":
+            return f"{value:.0f}{unit}"
+    raise AssertionError("the last unit takes everything")
 
 
 class Queries(DataTable[Text]):
     """The live questions: colour, count, best score; Enter goes to the next of its objects."""
 
+    DEFAULT_CSS = "Queries { overflow-x: hidden; }"
+    _FIXED = (("", 2), ("query", 13), ("n", 3), ("best", 5))  # what is left is for the status
+
+    def __init__(self, id: str | None = None) -> None:
+        super().__init__(id=id, cursor_type="row", cell_padding=0, cursor_foreground_priority="renderable")
+
     def on_mount(self) -> None:
         """Columns."""
-        self.cursor_type = "row"
-        for title in ("", "query", "n", "best", "status"):
-            self.add_column(title, key=title or "colour")
+        for title, width in self._FIXED:
+            self.add_column(title, key=title or "colour", width=width)
+        self.add_column("status", key="status", width=12)
+
+    def on_resize(self) -> None:
+        """The query and the status share what a wider terminal gives."""
+        more = max(self.size.width - sum(width for _, width in self._FIXED) - 12, 0)
+        for key, width in (("query", 13 + more // 3), ("status", 12 + more - more // 3)):
+            self.columns[ColumnKey(key)].width = width
+        self.refresh(layout=True)
 
     def show(self, queries: list[QueryStatus]) -> None:
         """Redraw, the cursor stays where it is."""
@@ -142,10 +180,13 @@ class Queries(DataTable[Text]):
             found = q.count > 0
             self.add_row(
                 Text("██", style=f"rgb({q.colour[0]},{q.colour[1]},{q.colour[2]})"),
-                Text(q.text[:40]),
+                Text(f" {q.text}"),
                 Text(str(q.count), style="bold" if found else "dim"),
                 Text(f"{q.score:.2f}" if q.score > 0.0 else "-"),
-                Text(q.status + (f": {q.note}" if q.note else ""), style="green" if found else "dim"),
+                Text(
+                    f"{q.status}: {q.note}" if q.note and self.size.width > _WIDE else q.status,
+                    style="green" if found else "dim",
+                ),
                 key=q.text,
             )
         if queries:
@@ -170,10 +211,12 @@ def gauges(status: Status) -> RenderResult:
     frames = f"{status.frames}/{status.frames_total}" if status.frames_total else str(status.frames)
     text.append(f"frame {frames}  ")
     text.append(f"{status.dropped} dropped  ", style="bold red" if status.dropped else "dim")
-    text.append(f"{status.map.vertices:,} vertices  {status.map.area_m2:,.0f} m2\n")
+    area = f"  {status.map.area_m2:,.0f} m2" if status.map.area_m2 else ""
+    text.append(f"{status.map.vertices:,} vertices{area}\n")
     text.append_text(_left("disk", status.disk_minutes))
     text.append_text(_left("battery", status.battery_minutes))
-    text.append_text(_synchronised(status))
+    if status.state != "replaying":  # a recording's clocks were locked when it was made, or not
+        text.append_text(_synchronised(status))
     if status.map.resident_mb:
         text.append(f"{status.map.resident_mb:.0f} MB  ")
     if status.segmentation_hz:
@@ -218,6 +261,9 @@ def advice(status: Status) -> Text:
     for stream in status.streams:
         if stream.message and stream.state in ("failed", "silent"):
             text.append(f"{stream.name}: {stream.message}\n", style="red")
+    for query in status.queries:
+        if query.note:
+            text.append(f"{query.text}: {query.note}\n", style="dim")
     lost = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in status.losses.items() if n)
     if lost:
         text.append(f"lost so far: {lost}\n", style="yellow")
