@@ -61,19 +61,23 @@ def sees(points: F32, T_cam_world: F64, lens: Lens, nearest: F32) -> F64:
     return out
 
 
-def colour_points(folder: Path, report: Report = silent) -> None:
-    """Colour ``points.bin`` of a map's folder with the images kept there; nothing without either."""
+def coloured_points(folder: Path, report: Report = silent) -> KeptPoints | None:
+    """The points of a map's folder, coloured with the images kept there the first time that they are asked for.
+
+    None where it keeps no points; without images no point has a colour. InputError if the file is damaged, OSError
+    where the folder cannot be written.
+    """
     kept = open_points(folder)
     index = folder / INDEX
-    if kept is None or not index.is_file():
-        return
+    if kept is None or kept.coloured or not index.is_file():
+        return kept
     points = np.concatenate([rows["position"] for rows in kept.chunks()])
     sums, seen = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.int64)
     total = count_photos(index)
     for done, photo in enumerate(read_photos(index)):
         _add_photo(points, photo, sums, seen)
         report(done + 1, total, photo.file)
-    kept.rewrite(_coloured(kept.chunks(), sums, seen))
+    return kept.with_colours(_coloured(kept.chunks(), sums, seen))
 
 
 def _add_photo(points: F32, photo: Photo, sums: F32, seen: I64) -> None:
@@ -116,9 +120,9 @@ class SplatCloud:
         return colours, number != NOTHING
 
 
-def open_splats(folder: Path) -> SplatCloud | None:
+def open_splats(folder: Path, report: Report = silent) -> SplatCloud | None:
     """The coloured points of a map's folder; None where it keeps none or no image saw any."""
-    kept = open_points(folder)
+    kept = coloured_points(folder, report)
     if kept is None or not any((rows["seen"] > 0).any() for rows in kept.chunks()):
         return None
     return SplatCloud(kept)

@@ -12,12 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
-from artemis_edge.colouring import colour_points
 from artemis_edge.config import KeepConfig, SegmentationConfig
 from artemis_edge.frames import F32, F64, LidarScan, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.kept_images import ImageSpool
 from artemis_edge.kept_points import PointSpool
-from artemis_edge.progress import Report, silent
 from artemis_edge.segmentation.keyframes import KeyframeStore
 from artemis_edge.trajectory import inverse
 
@@ -86,13 +84,12 @@ class Keeper:
         if self._keyframes is not None:
             self._keyframes.after_copy()
 
-    def save(self, folder: Path, trajectory: Trajectory, report: Report = silent) -> int:
-        """Write points, images and keyframes into a map's folder and colour the points; returns the size in bytes."""
+    def save(self, folder: Path, trajectory: Trajectory) -> int:
+        """Write points, images and keyframes into a map's folder; returns the size in bytes."""
         self.store()
         size = self._points.save(folder) + self._images.save(folder, trajectory)
         if self._keyframes is not None and len(self._keyframes):
             size += self._keyframes.save(folder)
-        colour_points(folder, report)
         return size
 
 

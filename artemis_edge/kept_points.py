@@ -1,14 +1,15 @@
 """``map/points.bin``: the input points in world coordinates with time, intensity and colour, in bounded number.
 
 A header of 32 bytes (magic, number of rows, ``stamp_ns`` of time zero, stride) and rows of ``ROW``,
-little-endian. Every ``stride``-th finite point of the input is there, in the order measured.
+little-endian. Every ``stride``-th finite point of the input is there, in the order measured. Colours come when they
+are first asked for; then the magic is another.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -33,7 +34,7 @@ ROW = np.dtype(
 )
 TICKS_PER_S = 100_000
 FULL_INTENSITY = 65535
-_MAGIC = b"ARTPTS1\n"
+_PLAIN, _COLOURED = b"ARTPTS1\n", b"ARTPTS2\n"
 _HEADER = struct.Struct("<8sqqq")
 _ROWS_AT_ONCE = 1 << 18
 
@@ -105,7 +106,7 @@ class PointSpool:
             return 0
         target = folder / FILE
         with target.open("wb") as out, self._path.open("rb") as spool:
-            out.write(_HEADER.pack(_MAGIC, self.rows, self._zero_ns or 0, self.stride))
+            out.write(_HEADER.pack(_PLAIN, self.rows, self._zero_ns or 0, self.stride))
             while part := spool.read(_ROWS_AT_ONCE * ROW.itemsize):
                 out.write(part)
         return target.stat().st_size
@@ -113,12 +114,13 @@ class PointSpool:
 
 @dataclass(frozen=True, slots=True)
 class KeptPoints:
-    """The points file of a map. ``zero_ns`` is the session time of tick 0."""
+    """The points file of a map. ``zero_ns`` is the session time of tick 0; ``coloured``: colours were looked for."""
 
     path: Path
     rows: int
     zero_ns: int
     stride: int
+    coloured: bool
 
     def chunks(self) -> Iterator[Rows]:
         """All rows, some at a time."""
@@ -127,12 +129,18 @@ class KeptPoints:
             for start in range(0, self.rows, _ROWS_AT_ONCE):
                 yield _read_rows(file, min(_ROWS_AT_ONCE, self.rows - start))
 
-    def rewrite(self, change: Iterator[Rows]) -> None:
-        """Overwrite all rows, in order, with those of ``change``, as many in all."""
-        with self.path.open("r+b") as file:
-            file.seek(_HEADER.size)
-            for rows in change:
-                file.write(rows.tobytes())
+    def with_colours(self, rows: Iterator[Rows]) -> KeptPoints:
+        """The file replaced by one of all ``rows``, in order, with their colours; all or nothing."""
+        part = self.path.with_name(f".{self.path.name}.part")
+        try:
+            with part.open("wb") as file:
+                file.write(_HEADER.pack(_COLOURED, self.rows, self.zero_ns, self.stride))
+                for some in rows:
+                    file.write(some.tobytes())
+            part.replace(self.path)
+        finally:
+            part.unlink(missing_ok=True)
+        return replace(self, coloured=True)
 
 
 def open_points(folder: Path) -> KeptPoints | None:
@@ -145,8 +153,8 @@ def open_points(folder: Path) -> KeptPoints | None:
     size = path.stat().st_size
     if len(head) == _HEADER.size:
         magic, rows, zero_ns, stride = _HEADER.unpack(head)
-        if magic == _MAGIC and rows >= 0 and size == _HEADER.size + rows * ROW.itemsize:
-            return KeptPoints(path, rows, zero_ns, stride)
+        if magic in (_PLAIN, _COLOURED) and rows >= 0 and size == _HEADER.size + rows * ROW.itemsize:
+            return KeptPoints(path, rows, zero_ns, stride, magic == _COLOURED)
     raise InputError(f"{path} is damaged or of another version; make the map again")
 
 

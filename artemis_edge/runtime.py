@@ -6,6 +6,7 @@ import gc
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -125,11 +126,13 @@ def reprocess(
             run.frames(report, interrupt, answering.between(keeper.between(photos.take, mapper)))
             if not statistics.frame_ms:
                 raise _nothing_mapped(run, source, span)
+            stage = partial(report, len(span), len(span))
+            stage("settling what was put off")
             run.flush()
         count_losses(statistics, source, tracker, mapper)
         results = Results(request.out)
         outcome = write_results(
-            results, run.trajectory(), mapper, keeper, photos, statistics, evaluate, answering
+            results, run.trajectory(), mapper, keeper, photos, statistics, evaluate, answering, stage
         )
     _complain(run, results, request.out)
     if outcome is not None and not outcome["triangles"]:
@@ -291,6 +294,10 @@ def count_losses(statistics: RunStatistics, source: FrameSource, odometry: Odome
     statistics.frames_dropped += source.lost.get("empty_file", 0)
 
 
+def unheard(_: str) -> None:
+    """Tell nobody."""
+
+
 def write_results(
     results: Results,
     trajectory: Trajectory,
@@ -300,8 +307,9 @@ def write_results(
     statistics: RunStatistics,
     evaluate: Evaluate | None,
     answering: Answering | None = None,
+    stage: Callable[[str], None] = unheard,
 ) -> dict[str, Any] | None:
-    """All results, small ones first; returns the report."""
+    """All results, small ones first; returns the report. ``stage`` is told what comes next."""
     results.attempt("trajectory.tum", lambda path: _write_tum(path, trajectory))
     results.text("config.toml", statistics.config_toml)
     results.json("objects.json", {"objects": []})
@@ -309,19 +317,25 @@ def write_results(
     if photos.every:
         lost = results.attempt(INDEX, lambda path: photos.write_index(path, trajectory, mapper.falloff))
         statistics.add_lost({"photos_without_pose": lost} if lost else {})
+    stage("finishing the mesh")
     mesh = results.attempt("mesh.ply", mapper.write_mesh)
+    stage("saving the map")
     saved = results.directory("map", lambda folder: (mapper.save(folder), keeper.save(folder, trajectory)))
     statistics.map_bytes, statistics.kept_bytes = saved or (0, 0)
     if mesh is None:
         return None
     whole = mesh
+    stage("writing mesh.glb and objects.json")
     replies = answering.replies(whole, mapper) if answering is not None else []
     if replies:
         results.json("objects.json", objects_json(replies))
     atlas = read_atlas(results.folder / "map") if saved else None
     results.attempt("mesh.glb", lambda path: write_glb(path, whole, atlas))
     statistics.peak_rss_mb = health.peak_resident_mb() or None
+    if evaluate is not None:
+        stage("measuring against the truth")
     evaluation = evaluate(whole, trajectory) if evaluate is not None and len(whole.faces) else None
+    stage("drawing the report")
     return results.attempt(
         "report.html",
         lambda path: write_report(

@@ -40,18 +40,26 @@ def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> type[Child]:
 def test_a_kind_of_input_is_compiled_for_once(child: type[Child], kitti: Path, tmp_path: Path) -> None:
     source = open_input(kitti)
     given, own = (Request(kitti, tmp_path / "out", poses=p) for p in (poses_of(kitti), None))
-    for request, count in ((given, 1), (given, 1), (own, 2), (own, 2)):
+    for request, count in ((given, 1), (given, 1), (own, 3), (own, 3)):
         compile_ahead.compile_ahead(request, source, range(10))
         assert child.started == count
 
 
 def test_what_failed_is_tried_again(child: type[Child], kitti: Path, tmp_path: Path) -> None:
     child.exitcode = 1
-    for count in (1, 2):
+    for count in (2, 4):  # the odometry and the map
         compile_ahead.compile_ahead(Request(kitti, tmp_path / "out"), open_input(kitti), range(10))
         assert child.started == count
 
 
-def test_the_child_leaves_its_cache_only(kitti: Path, tmp_path: Path) -> None:
-    compile_ahead._compile(Request(kitti, tmp_path / "out", poses=poses_of(kitti), stop=1))
+@pytest.mark.parametrize("part", [compile_ahead.MAP, compile_ahead.ODOMETRY])
+@pytest.mark.parametrize("own", [False, True])
+def test_the_child_leaves_its_cache_only(kitti: Path, tmp_path: Path, part: str, own: bool) -> None:
+    poses = None if own else poses_of(kitti)
+    compile_ahead._compile(Request(kitti, tmp_path / "out", poses=poses, stop=1), part)
     assert not (tmp_path / "out").exists()
+
+
+def test_the_child_leaves_faults_to_the_run(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        compile_ahead._compile(Request(tmp_path / "nothing", tmp_path / "out"), compile_ahead.MAP)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from artemis_edge.cli import main
-from artemis_edge.colouring import add_colours, colour_points, open_splats
+from artemis_edge.colouring import add_colours, coloured_points, open_splats
 from artemis_edge.errors import InputError
 from artemis_edge.evaluate.likeness import channel_gains, psnr_db, ssim
 from artemis_edge.evaluate.photos import read_photos
@@ -206,13 +206,15 @@ def room(tmp_path: Path) -> Path:
     spool.save(folder)
     write_photos(folder, INDEX, [0.05, -0.1])
     write_photos(tmp_path, "PHOTOS.json", [0.0, 0.02], gain=0.5)
-    colour_points(folder)
     return tmp_path
 
 
 def test_points_take_the_mean_of_the_images_that_see_them(room: Path) -> None:
-    kept = open_points(room / "map")
+    kept = coloured_points(room / "map")
     assert kept is not None
+    before = kept.path.stat()
+    assert coloured_points(room / "map") == open_points(room / "map") == kept
+    assert kept.path.stat() == before and kept.coloured  # once
     rows = np.concatenate(list(kept.chunks()))
     assert (rows["seen"][300:] == 2).mean() > 0.4
     assert (rows["seen"][:300] == 0).mean() > 0.8  # behind the wall
@@ -280,7 +282,6 @@ def test_a_map_whose_points_no_image_saw_has_no_baseline(tmp_path: Path) -> None
     spool = PointSpool(tmp_path / "spool", 100)
     spool.add(np.eye(3, dtype=np.float32), 0, np.zeros(3, np.float32), None)
     spool.save(tmp_path)
-    colour_points(tmp_path)
     assert open_splats(tmp_path) is None
 
 

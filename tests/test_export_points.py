@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from artemis_edge.cli import main
-from artemis_edge.colouring import add_colours, colour_points, sees
+from artemis_edge.colouring import add_colours, sees
 from artemis_edge.evaluate.photos import read_photos
 from artemis_edge.export import colmap
 from artemis_edge.export.colmap import undistorted
@@ -54,7 +54,6 @@ def room(tmp_path: Path) -> Path:
         png = bytes(cv2.imencode(".png", np.rint(picture[..., ::-1]).astype(np.uint8))[1])
         images.add(CameraImage("cam", stamp, png, CAMERA, T_CAM_LIDAR))
     images.save(folder, trajectory)
-    colour_points(folder)
     return tmp_path
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from artemis_edge.colouring import coloured_points
 from artemis_edge.config import Config, KeepConfig, SegmentationConfig
 from artemis_edge.evaluate.photos import read_photos
 from artemis_edge.frames import (
@@ -75,7 +76,7 @@ def keep(folder: Path, rules: KeepConfig, every: list[SyncedFrame]) -> Path:
 
 
 def test_points_lie_in_the_world_and_have_the_mean_colour(tmp_path: Path) -> None:
-    kept = open_points(keep(tmp_path, KeepConfig(), frames(4)))
+    kept = coloured_points(keep(tmp_path, KeepConfig(), frames(4)))
     assert kept is not None
     rows = np.concatenate(list(kept.chunks()))
     np.testing.assert_allclose(rows["position"][:, 0], 9.0, atol=1e-5)

@@ -171,7 +171,8 @@ def run(map_path: Path, photos: Path, report: Report = silent) -> TextureEvaluat
     """The command ``evaluate texture``; raises InputError for files that are not what they should be."""
     mesh, atlas = open_map(map_path)
     folder = map_folder(map_path)
-    return evaluate_texture(mesh, atlas, None if folder is None else open_splats(folder), photos, report)
+    splats = None if folder is None else open_splats(folder, report)
+    return evaluate_texture(mesh, atlas, splats, photos, report)
 
 
 def to_text(evaluation: TextureEvaluation) -> str:

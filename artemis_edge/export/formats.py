@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from artemis_edge.colouring import coloured_points
 from artemis_edge.errors import InputError
 from artemis_edge.export.colmap import write_colmap
 from artemis_edge.export.glb import write_glb
@@ -13,7 +14,7 @@ from artemis_edge.export.mesh import Mesh
 from artemis_edge.export.obj import write_obj
 from artemis_edge.export.ply import write_ply
 from artemis_edge.geo.place import Placed, read_georeference
-from artemis_edge.kept_points import KeptPoints, open_points
+from artemis_edge.kept_points import KeptPoints
 from artemis_edge.opened_map import map_folder, open_map
 from artemis_edge.progress import Report, silent
 
@@ -34,7 +35,7 @@ def write(
     """
     placed = _placed(map_path) if georeferenced and name != "colmap" else None
     if name in ("laz", "colmap"):
-        folder, kept = _points(map_path, name)
+        folder, kept = _points(map_path, name, report)
         if name == "colmap":
             write_colmap(out, kept, folder, report)
         else:
@@ -65,9 +66,9 @@ def _in_crs(mesh: Mesh, placed: Placed) -> Mesh:
     return replace(mesh, vertices=placed.to_local(mesh.vertices), normals=normals)
 
 
-def _points(map_path: Path, name: str) -> tuple[Path, KeptPoints]:
+def _points(map_path: Path, name: str, report: Report) -> tuple[Path, KeptPoints]:
     folder = map_folder(map_path)
-    kept = None if folder is None else open_points(folder)
+    kept = None if folder is None else coloured_points(folder, report)
     if folder is None or kept is None:
         raise InputError(
             f"{map_path} keeps no points, which {name} is made of; give the output directory of "

@@ -17,6 +17,7 @@ from artemis_edge.export.ply import Mesh, read_mesh
 from artemis_edge.frames import F32, F64, Trajectory
 from artemis_edge.progress import Report, progress, say
 from artemis_edge.runtime import MakeMapper, Outcome, Request, pipeline, reprocess
+from artemis_edge.session.compile_demo import compiling
 from artemis_edge.session.report import Evaluation
 from artemis_edge.session.results import prepare
 from artemis_edge.session.simulate import simulate
@@ -49,13 +50,13 @@ def demo(
     prepare(out)
     session = out / SESSION
     prepare(session)
+    request = Request(session, out, own_odometry=True, queries=tuple(queries))
     say(f"recording a walk of {seconds:g} s through the virtual world '{world}'")
-    with reporter("recording") as report:
+    with compiling(request, world, seed, _SETTINGS), reporter("recording") as report:
         made = simulate(world, seed, seconds, "avia", session, _SETTINGS, report)
     for note in made.notes:
         say(f"note: {note}")
     say("mapping it by its own odometry (the truth is only for measuring)")
-    request = Request(session, out, own_odometry=True, queries=tuple(queries))
     with reporter("mapping") as report:
         outcome = reprocess(request, report, lambda mesh, path: measure(mesh, path, made.truth), make)
     return _closing(outcome, made.length_m)
