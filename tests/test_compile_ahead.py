@@ -54,8 +54,11 @@ def test_what_failed_is_tried_again(child: type[Child], kitti: Path, tmp_path: P
 
 @pytest.mark.parametrize("part", [compile_ahead.MAP, compile_ahead.ODOMETRY])
 @pytest.mark.parametrize("own", [False, True])
-def test_the_child_leaves_its_cache_only(kitti: Path, tmp_path: Path, part: str, own: bool) -> None:
+def test_the_child_leaves_its_cache_only(
+    kitti: Path, tmp_path: Path, part: str, own: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     poses = None if own else poses_of(kitti)
+    monkeypatch.setattr(compile_ahead.os, "nice", lambda _: 0)
     compile_ahead._compile(Request(kitti, tmp_path / "out", poses=poses, stop=1), part)
     assert not (tmp_path / "out").exists()
 
