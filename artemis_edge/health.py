@@ -1,8 +1,9 @@
-"""What the machine has left: memory, processors, disk. Readings only; whoever asks decides what is enough."""
+"""What the machine has left: memory, processors, disk. Whoever asks decides what is enough."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import shutil
 from pathlib import Path
@@ -26,6 +27,12 @@ def restart_peak() -> None:
 def peak_resident_mb() -> float:
     """Largest resident memory since ``restart_peak`` (or ever), MB; 0 where the system does not say."""
     return _proc_field(Path("/proc/self/status"), "VmHWM:")
+
+
+def give_back_memory() -> None:
+    """Return freed memory to the system, which glibc keeps else: 84 MB after a 20-minute recording is opened."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def available_memory_mb() -> float:

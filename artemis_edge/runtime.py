@@ -260,6 +260,7 @@ def warm_up_run(
     warm_up_here(request.config, odometry, pages, source, span, make)
     statistics.warmup_s = time.perf_counter() - start
     gc.collect()
+    health.give_back_memory()
 
 
 def with_tiny_map(config: Config) -> Config:

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from artemis_edge import topics
+from artemis_edge import health, topics
 from artemis_edge.config import Config, to_toml
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.exclusion import Zones
@@ -151,6 +151,7 @@ def warm_up(config: Config, folder: Path, make: MakeMapper = pipeline) -> float:
     mapping.mapper.finish()
     del mapping
     gc.collect()
+    health.give_back_memory()
     return time.perf_counter() - start
 
 
