@@ -208,6 +208,10 @@ def _reprocess(commands: Any) -> None:
     parser.add_argument(
         "--model", default="", metavar="NAME", help="network that looks for it ('models list')"
     )
+    parser.add_argument(
+        "--continue", type=Path, metavar="MAP", dest="go_on",
+        help="recognise the place in a map made before and extend that map, in its frame",
+    )  # fmt: skip
     json_option(parser)
 
 
@@ -319,6 +323,7 @@ def run_reprocess(given: argparse.Namespace) -> int:
                 given.holdout,
                 tuple(given.query),
                 given.model,
+                given.go_on,
             )
             for settings in [config.load(profile=given.profile, sets=[*given.sets, *moved])]
             for path, out in batch.places(given.inputs, given.out)

@@ -15,8 +15,8 @@ import numpy as np
 from artemis_edge.config import KeepConfig, SegmentationConfig
 from artemis_edge.frames import F32, F64, LidarScan, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.kept_images import ImageSpool
-from artemis_edge.kept_points import PointSpool
-from artemis_edge.segmentation.keyframes import KeyframeStore
+from artemis_edge.kept_points import PointSpool, open_points
+from artemis_edge.segmentation.keyframes import KeyframeStore, photographs
 from artemis_edge.trajectory import inverse
 
 Prepare = Callable[[SyncedFrame], SyncedFrame]
@@ -43,6 +43,16 @@ class Keeper:
             None if segmentation is None else KeyframeStore.by(segmentation, folder / "keyframes")
         )
         self._pending: tuple[SyncedFrame, Tracker] | None = None
+
+    def take_over(self, folder: Path) -> None:
+        """Begin with what the folder ``map/`` of a map made before has kept."""
+        points = open_points(folder)
+        if points is not None:
+            self._points.take_over(points)
+        self._images.take_over(folder)
+        if self._keyframes is not None:
+            for image, T_world_cam in photographs(folder):
+                self._keyframes.offer(image, T_world_cam)
 
     def between(self, prepare: Prepare, tracker: Tracker) -> Prepare:
         """``prepare``, which is called before every frame, after what the last frame brought is written."""

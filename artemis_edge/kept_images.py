@@ -6,15 +6,17 @@ The index has the form of PHOTOS.json. Exporters and the colouring of points use
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from artemis_edge.export.atomic import write_bytes
-from artemis_edge.frames import CameraImage, Trajectory
+from artemis_edge.frames import F64, CameraImage, CameraModel, Trajectory
 from artemis_edge.session.photos import photo_entry, suffix_of
-from artemis_edge.trajectory import covered, interpolate
+from artemis_edge.trajectory import covered, interpolate, inverse
 
 FOLDER = "images"
 INDEX = "images.json"
@@ -28,6 +30,23 @@ class ImageSpool:
         self._stride = 1
         self._offered: dict[str, int] = {}
         self._kept: list[tuple[int, str, CameraImage]] = []  # number within its camera, file name, image
+        self._placed: dict[str, F64] = {}  # T_world_cam of images of a map made before, by file name
+
+    def take_over(self, folder: Path) -> None:
+        """Begin with the images of a map made before."""
+        index = folder / INDEX
+        entries = json.loads(index.read_text("utf-8"))["photos"] if index.is_file() else []
+        for entry in entries:
+            source = folder / str(entry["file"])
+            if not source.is_file():
+                continue
+            camera, _, number = source.stem.rpartition("_")
+            image = _image(camera, entry)
+            shutil.copyfile(source, self._folder / source.name)
+            self._offered[camera] = max(self._offered.get(camera, 0), int(number) + 1)
+            self._kept.append((int(number), source.name, image))
+            self._placed[source.name] = inverse(np.array(entry["T_cam_world"], np.float64))
+        self._thin()
 
     def add(self, image: CameraImage) -> None:
         """Write the image, or leave it out."""
@@ -38,6 +57,9 @@ class ImageSpool:
         name = f"{image.name}_{number:06d}.{suffix_of(image.encoded)}"
         (self._folder / name).write_bytes(image.encoded)
         self._kept.append((number, name, replace(image, encoded=b"")))
+        self._thin()
+
+    def _thin(self) -> None:
         while len(self._kept) > max(self._most, len(self._offered)):
             self._stride *= 2
             for old, file, _ in self._kept:
@@ -55,13 +77,15 @@ class ImageSpool:
         The pose of an image is interpolated at the middle of its exposure.
         """
         stamps = np.array([image.stamp_ns for _, _, image in self._kept], np.int64)
-        known = np.flatnonzero(covered(trajectory, stamps))
+        placed = np.array([name in self._placed for _, name, _ in self._kept], bool)
+        known = np.flatnonzero(placed | covered(trajectory, stamps))
         if len(known) == 0:
             return 0
         (folder / FOLDER).mkdir()
         poses, entries, size = interpolate(trajectory, stamps), [], 0
         for k in known.tolist():
             _, name, image = self._kept[k]
+            poses[k] = self._placed.get(name, poses[k])
             target = folder / FOLDER / name
             (self._folder / name).replace(target)
             size += target.stat().st_size
@@ -69,3 +93,11 @@ class ImageSpool:
         content = (json.dumps({"photos": entries}, indent=1) + "\n").encode()
         write_bytes(folder / INDEX, content)
         return size + len(content)
+
+
+def _image(camera: str, entry: dict[str, Any]) -> CameraImage:
+    """Without its bytes, in a frame of its own; the size of the picture is not in the index."""
+    k1, k2, p1, p2, k3 = (float(value) for value in entry["distortion"])
+    fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
+    model = CameraModel(0, 0, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    return CameraImage(camera, int(entry.get("stamp_ns", 0)), b"", model, np.eye(4))

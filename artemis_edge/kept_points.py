@@ -75,6 +75,18 @@ class PointSpool:
         while self.rows > self._most:
             self._halve()
 
+    def take_over(self, kept: KeptPoints) -> None:
+        """Begin with the points of a map made before, at their own times as far as those fit into the file."""
+        if self._most == 0:
+            return
+        with self._path.open("ab") as file:
+            for rows in kept.chunks():
+                file.write(rows.tobytes())
+        self.rows, self.stride, self._zero_ns = kept.rows, max(kept.stride, 1), kept.zero_ns
+        self._offered = self.rows * self.stride
+        while self.rows > self._most:
+            self._halve()
+
     def _zero(self, stamp_ns: int, earliest_s: float) -> int:
         if self._zero_ns is None:
             self._zero_ns = stamp_ns + int(np.floor(min(earliest_s, 0.0) * 1e9))

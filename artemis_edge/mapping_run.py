@@ -6,7 +6,7 @@ import gc
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -18,7 +18,9 @@ from artemis_edge import health
 from artemis_edge.errors import InputError, RunError, UserError
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F32, F64, FrameSource, MeshDelta, SyncedFrame, TrackedFrame, Trajectory
+from artemis_edge.paging import Page
 from artemis_edge.progress import Report, say
+from artemis_edge.refinement.photographs import Waiting
 from artemis_edge.session.results import disk_sentence
 from artemis_edge.session.statistics import RunStatistics
 
@@ -39,6 +41,10 @@ class Mapper(Protocol):
     @property
     def lost(self) -> Mapping[str, int]:
         """What the stages could not use, by reason."""
+        ...
+
+    def take_over(self, pages: Iterable[Page], photographs: Iterable[Waiting]) -> None:
+        """Begin with the blocks of a map made before and the photographs that colour it."""
         ...
 
     def process(self, frame: SyncedFrame) -> MeshDelta:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -34,6 +34,7 @@ from artemis_edge.frames import F32, I32, I64, U8, Bool
 from artemis_edge.voxel_map import AT_ONCE
 
 TIGHT = 0.85  # share of a pool from which on blocks go to disk
+_ADOPTED = 0.5  # share of memory that a map made before may take
 BUSY_FRAMES = 50  # a block seen this lately is not sent to disk
 
 _HEADER = struct.Struct("<4sIiiiIII")
@@ -359,7 +360,22 @@ def page_from_bytes(data: bytes) -> Page:
     magic, v, bx, by, bz, c, t, attributes = _HEADER.unpack_from(data)
     if magic != _MAGIC:
         raise ValueError("not a page")
-    shapes: list[tuple[str, tuple[int, ...]]] = [
+    shapes = _shapes(v, c, t, attributes)
+    at, arrays = _HEADER.size, []
+    for kind, shape in shapes:
+        count = int(np.prod(shape))
+        if at + count * np.dtype(kind).itemsize > len(data):
+            raise ValueError("page cut off")
+        arrays.append(np.frombuffer(data, kind, count, at).reshape(shape))
+        at += count * np.dtype(kind).itemsize
+    if arrays[2].sum() != c or arrays[3].sum() != t:
+        raise ValueError("page does not add up")
+    return Page(np.array([[bx, by, bz]], np.int32), np.array([v], np.int32), *arrays)
+
+
+def _shapes(v: int, c: int, t: int, attributes: int) -> list[tuple[str, tuple[int, ...]]]:
+    """Kinds and shapes of a page's arrays, in their order."""
+    return [
         ("<i2", (v,)),
         ("<i4", (v, 3)),
         ("<i2", (v,)),
@@ -372,16 +388,28 @@ def page_from_bytes(data: bytes) -> Page:
         ("<u1", (c,)),
         ("<u2", (t, 3)),
     ]
-    at, arrays = _HEADER.size, []
-    for kind, shape in shapes:
-        count = int(np.prod(shape))
-        if at + count * np.dtype(kind).itemsize > len(data):
-            raise ValueError("page cut off")
-        arrays.append(np.frombuffer(data, kind, count, at).reshape(shape))
-        at += count * np.dtype(kind).itemsize
-    if arrays[2].sum() != c or arrays[3].sum() != t:
-        raise ValueError("page does not add up")
-    return Page(np.array([[bx, by, bz]], np.int32), np.array([v], np.int32), *arrays)
+
+
+def read_pages(path: Path) -> Iterator[Page]:
+    """The pages of a saved map, one after the other; ValueError where the file is no such."""
+    with path.open("rb") as file:
+        while head := file.read(_HEADER.size):
+            if len(head) < _HEADER.size or not head.startswith(_MAGIC):
+                raise ValueError("not a page")
+            _, v, _, _, _, c, t, attributes = _HEADER.unpack(head)
+            size = sum(
+                int(np.prod(shape)) * np.dtype(kind).itemsize for kind, shape in _shapes(v, c, t, attributes)
+            )
+            yield page_from_bytes(head + file.read(size))
+
+
+def with_attributes(page: Page, columns: int) -> Page:
+    """The page for a store with so many columns of attributes: colours stay, classes are asked for anew."""
+    attribute = np.zeros((len(page.cell), columns), np.float32)
+    both = min(columns, page.attribute.shape[1], bs.LOG_CLASS)
+    attribute[:, :both] = page.attribute[:, :both]
+    voxel_class = np.zeros((len(page.inner), bs.class_columns(columns)), np.float32)
+    return replace(page, attribute=attribute, voxel_class=voxel_class)
 
 
 class PageFile:
@@ -489,6 +517,13 @@ class Pager:
         """Slots of resident blocks, sorted by key."""
         slots = self._slots[: resident_blocks(self._store, self._slots)].copy()
         return slots[np.argsort(slot_keys(self._store, slots), kind="stable")]
+
+    def adopt(self, page: Page) -> None:
+        """Take a page of a map made before: into memory while half of it is free, else onto the disk."""
+        key = int(block_keys(page.block)[0])
+        self.file.put(key, page)
+        if self.fill() < _ADOPTED:
+            self._restore(key, 0)
 
     def bring_back(self, touched: I32, stamp: int) -> None:
         """Load the pages of touched blocks and of their neighbours, whose patches must meet."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,7 +17,8 @@ from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
 from artemis_edge.map_writer import save_map, write_mesh, write_removed
 from artemis_edge.mesher import Mesher
-from artemis_edge.paging import TIGHT, Pager
+from artemis_edge.paging import TIGHT, Page, Pager, with_attributes
+from artemis_edge.refinement.photographs import Waiting
 from artemis_edge.refinement.stage import Refinement
 from artemis_edge.semantic_constraint import SemanticConstraint
 from artemis_edge.semantic_map import Segmenter, SemanticMap
@@ -54,6 +55,14 @@ class Pipeline:
         self.stage_ms: dict[str, float] = {}
         self._stamp = 0
         self._mesh: Mesh | None = None
+
+    def take_over(self, pages: Iterable[Page], photographs: Iterable[Waiting]) -> None:
+        """Begin with the blocks of a map made before, and what colours them, before the first frame."""
+        for page in pages:
+            self.pager.adopt(with_attributes(page, self.voxel_map.store.attribute.shape[1]))
+        for waiting in photographs:
+            self.refinement.keyframes.offer(waiting)
+        self.tell_everything()
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
         """All stages for one frame."""

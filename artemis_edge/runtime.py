@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from artemis_edge import health
 from artemis_edge.compile_ahead import compile_ahead
 from artemis_edge.config import Config, OdometryConfig, to_toml
+from artemis_edge.continuing import EarlierMap, find_start, open_earlier
 from artemis_edge.datasets import lidar_poses, open_input
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.export.atlas import read_atlas
@@ -24,10 +26,12 @@ from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import FrameSource, Odometry, SyncedFrame, Trajectory
 from artemis_edge.highlight import Reply
 from artemis_edge.keeper import Keeper
+from artemis_edge.loop.corrected import CorrectedOdometry
 from artemis_edge.mapping_run import Interrupt, Mapper, MappingRun, readable, warm_up
 from artemis_edge.odometry.choice import OwnOdometry, odometry_for
 from artemis_edge.odometry.given_poses import GivenPoses
 from artemis_edge.odometry.inertial_odometry import InertialOdometry
+from artemis_edge.odometry.known_map import Start
 from artemis_edge.odometry.visual import VisualUpdate
 from artemis_edge.progress import Report, silent
 from artemis_edge.questions import BlankMasks, Questions, ScheduledMasks, every_image, unanswered
@@ -54,7 +58,7 @@ class Request:
 
     ``start`` and ``stop`` bound the frames (None: the end); ``holdout`` keeps every N-th photograph of each
     camera out of the map (0: none). ``queries`` are questions that the map is to answer, with the ``model`` of the
-    registry (empty: that of the configuration).
+    registry (empty: that of the configuration). ``go_on`` is a map to be continued.
     """
 
     input: Path
@@ -67,6 +71,7 @@ class Request:
     holdout: int = 0
     queries: tuple[str, ...] = ()
     model: str = ""
+    go_on: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,11 +116,14 @@ def reprocess(
     source = open_input(request.input, request.config.input, request.config.exclusion)
     span = frame_span(source, request)
     odometry = choose_odometry(source, request, span)
+    earlier = None if request.go_on is None else open_earlier(request.go_on, request.config)
     prepare(request.out)
     statistics = RunStatistics(source.name, source.input_hz, config_toml=to_toml(request.config))
     with scratch(request.out) as pages, Answering(request) as answering:
         with Interrupt() as interrupt, telling(request.config.view) as live:
             warm_up_run(request, odometry, pages, source, span, statistics, make)
+            if earlier is not None:
+                odometry = placed(earlier, odometry, source, request, span, statistics)
             tracker = odometry()
             if request.config.odometry.close_loops and isinstance(tracker, OwnOdometry):
                 tracker = corrected(tracker, odometry, source, span)
@@ -123,6 +131,8 @@ def reprocess(
             mapper = answering.mapper(make, photos.watching(tracker), pages)
             run = MappingRun(mapper, source, span, statistics, live.watching(mapper))
             keeper = Keeper(pages, request.config.keep, request.config.segmentation)
+            if earlier is not None:
+                earlier.into(mapper, keeper)
             run.frames(report, interrupt, answering.between(keeper.between(photos.take, mapper)))
             if not statistics.frame_ms:
                 raise _nothing_mapped(run, source, span)
@@ -137,7 +147,8 @@ def reprocess(
     _complain(run, results, request.out)
     if outcome is not None and not outcome["triangles"]:
         raise _nothing_meshed(outcome, request, results)
-    warnings = [*source.warnings, *_skipped(run, statistics), *mapper.warnings, *answering.warnings]
+    told = [*source.warnings, *statistics.notes, *_skipped(run, statistics)]
+    warnings = [*told, *mapper.warnings, *answering.warnings]
     return Outcome(request.out, outcome or {}, statistics, run.trajectory(), warnings)
 
 
@@ -207,6 +218,27 @@ def frame_span(source: FrameSource, request: Request) -> range:
     return range(request.start, stop)
 
 
+def placed(
+    earlier: EarlierMap,
+    odometry: Callable[[], Odometry],
+    source: FrameSource,
+    request: Request,
+    span: range,
+    statistics: RunStatistics,
+) -> Callable[[], Odometry]:
+    """The odometry in the frame of a map made before, in which the recording must be recognised.
+
+    An odometry of ours then also registers to that map; given poses are only moved there.
+    """
+    found = find_start(earlier, odometry, _frames(source, span), source.name)
+    statistics.continued = earlier.account(found, int(source.stamp_ns[span.start]))
+    start = earlier.start(found)
+    if isinstance(odometry(), OwnOdometry):
+        return lambda: own_odometry(request.config.odometry, lambda: _frames(source, span), start)
+    fixed = Trajectory(np.zeros(1, np.int64), found.T_map_world[None])
+    return lambda: CorrectedOdometry(odometry(), fixed)
+
+
 def choose_odometry(source: FrameSource, request: Request, span: range) -> Callable[[], Odometry]:
     """Given poses, else those of the input, else the odometry; called once for every run over the frames."""
     if request.poses is not None:
@@ -223,16 +255,18 @@ def choose_odometry(source: FrameSource, request: Request, span: range) -> Calla
     return lambda: own_odometry(request.config.odometry, lambda: _frames(source, span))
 
 
-def own_odometry(config: OdometryConfig, frames: Callable[[], Iterator[SyncedFrame]]) -> OwnOdometry:
-    """The odometry of a recording, with its images unless the configuration says no."""
-    return odometry_for(config, frames, VisualUpdate() if config.visual else None)
+def own_odometry(
+    config: OdometryConfig, frames: Callable[[], Iterator[SyncedFrame]], start: Start | None = None
+) -> OwnOdometry:
+    """The odometry of a recording, with its images unless the configuration says no; from a ``start`` in a map."""
+    return odometry_for(config, frames, VisualUpdate() if config.visual else None, start)
 
 
 def corrected(
     tracker: Odometry, odometry: Callable[[], Odometry], source: FrameSource, span: range
 ) -> Odometry:
     """The odometry with the loops of the recording closed, for which it runs once beforehand."""
-    from artemis_edge.loop.corrected import CorrectedOdometry, close_loops
+    from artemis_edge.loop.corrected import close_loops
 
     closed = close_loops(odometry, _frames(source, span))
     source.warnings.append(closed.sentence())
@@ -291,6 +325,7 @@ def count_losses(statistics: RunStatistics, source: FrameSource, odometry: Odome
     odometry = getattr(odometry, "inner", odometry)
     if isinstance(odometry, OwnOdometry):
         losses = odometry.losses if isinstance(odometry, InertialOdometry) else odometry.lost
+        statistics.notes += [odometry.instruction] if odometry.instruction is not None else []
         statistics.add_lost({f"odometry_{reason.replace(' ', '_')}": n for reason, n in losses.items()})
     statistics.frames_dropped += source.lost.get("empty_file", 0)
 

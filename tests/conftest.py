@@ -1,7 +1,7 @@
 """What several test files share: a small mapper in place of the pipeline, and small inputs."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +22,7 @@ class FakeMapper:
         self.tracked: TrackedFrame | None = None
         self.lost: dict[str, int] = {}
         self.finished = False
+        self.earlier: list[object] = []
         self.before_frame: Callable[[int], None] = lambda index: None
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
@@ -44,6 +45,9 @@ class FakeMapper:
             f32[:, 0],
             triples,
         )
+
+    def take_over(self, pages: Iterable[object], photographs: Iterable[object]) -> None:
+        self.earlier = list(pages)
 
     def finish(self) -> None:
         self.finished = True

@@ -146,3 +146,15 @@ def test_no_measurement_changes_nothing():
     np.testing.assert_allclose(found.minus(prior), 0.0, atol=1e-12)
     np.testing.assert_allclose(found.P, prior.P)
     assert replace(found, P=prior.P).cameras == prior.cameras
+
+
+def test_a_state_moved_to_another_frame_goes_the_same_way():
+    rng = np.random.default_rng(9)
+    root = rng.normal(size=(18, 18))
+    there, turn = state(root @ root.T), se3.exp(rng.normal(size=6))
+    moved, J = there.moved(turn), np.eye(len(there))
+    for part in (slice(0, 3), slice(6, 9), slice(15, 18)):  # place, velocity and gravity are in world
+        J[part, part] = turn[:3, :3]
+    error = 1e-6 * rng.normal(size=len(there))
+    np.testing.assert_allclose(moved.plus(J @ error).minus(there.plus(error).moved(turn)), 0.0, atol=1e-11)
+    np.testing.assert_allclose(moved.P, J @ there.P @ J.T, atol=1e-9)

@@ -21,6 +21,12 @@ class CorrectedOdometry:
     inner: Odometry
     correction: Trajectory
 
+    @property
+    def instruction(self) -> str | None:
+        """A sentence for the operator, or None."""
+        said: str | None = getattr(self.inner, "instruction", None)
+        return said
+
     def track(self, frame: SyncedFrame) -> TrackedFrame:
         """As Odometry: the points are moved by the inner odometry, only the frame's place in world changes."""
         tracked = self.inner.track(frame)

@@ -12,6 +12,7 @@ from artemis_edge.frames import ImuSamples, SyncedFrame
 from artemis_edge.odometry.image_update import ImageUpdate
 from artemis_edge.odometry.imu import levelling
 from artemis_edge.odometry.inertial_odometry import InertialOdometry
+from artemis_edge.odometry.known_map import Start
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.odometry.propagation import HOLE_S
 
@@ -26,12 +27,16 @@ def odometry_for(
     config: OdometryConfig,
     frames: Callable[[], Iterator[SyncedFrame]],
     images: ImageUpdate | None = None,
+    start: Start | None = None,
 ) -> OwnOdometry:
-    """The odometry of a recording, which may be looked at from its start as often as needed."""
+    """The odometry of a recording, which may be looked at from its start as often as needed.
+
+    With a ``start`` it goes on in a known map.
+    """
     first = list(islice(frames(), _LOOKED_AT))
     if all(fast_enough(frame.imu) for frame in first) and first:
-        return InertialOdometry.looking_ahead(config, first, images)
-    return LidarOdometry.looking_ahead(config, first)
+        return InertialOdometry.looking_ahead(config, first, images, start)
+    return LidarOdometry.looking_ahead(config, first, start)
 
 
 def fast_enough(imu: ImuSamples) -> bool:

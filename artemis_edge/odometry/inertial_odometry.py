@@ -7,6 +7,7 @@ local map, then by one image after the other; then add the scan to the map.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from artemis_edge.odometry import imu as inertial
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.deskew import deskew_frame, move_points, window
 from artemis_edge.odometry.image_update import ImageUpdate, SeenScan
+from artemis_edge.odometry.known_map import Start
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.odometry.local_map import LocalMap
 from artemis_edge.odometry.normals import weakest_direction
@@ -27,7 +29,7 @@ from artemis_edge.odometry.propagation import ImuNoise, propagate
 from artemis_edge.odometry.registration import arm_m
 from artemis_edge.odometry.rest import INSTRUCTION, first_state
 from artemis_edge.odometry.scan_motion import steady
-from artemis_edge.odometry.state import State, iterated_update
+from artemis_edge.odometry.state import POSITION, ROTATION, State, iterated_update
 from artemis_edge.odometry.thin import Thinner, ThinScan, TimedPoints
 
 _START_FRAMES = 2  # looked at beforehand to know how fast a recording begins
@@ -40,6 +42,7 @@ _SURE_M = 0.1  # expected miss at the points up to which the IMU's word is as go
 _SAME_TIME_S = 1e-3  # frames that share a stamp are taken to be a millisecond apart
 _KEPT_NS = 200_000_000  # samples kept behind the state, so that its own time can be interpolated
 _GIVE_UP = 10  # frames lost in a row after which the map is begun anew at the predicted pose
+_PLACED_M, _PLACED_RAD = 0.1, 0.01  # one sigma of the first pose in a known map
 
 
 class _Arrived(NamedTuple):
@@ -67,9 +70,13 @@ class InertialOdometry:
     """
 
     def __init__(
-        self, config: OdometryConfig, images: ImageUpdate | None = None, start_velocity: F64 | None = None
+        self,
+        config: OdometryConfig,
+        images: ImageUpdate | None = None,
+        start_velocity: F64 | None = None,
+        start: Start | None = None,
     ) -> None:
-        """``start_velocity`` (3,) m/s in the lidar frame, where it is known."""
+        """``start_velocity`` (3,) m/s in the lidar frame, where it is known; ``start`` to go on in a known map."""
         self.lost: dict[str, int] = {}
         self.instruction: str | None = None
         self._config = config
@@ -84,7 +91,8 @@ class InertialOdometry:
             config.acceleration,
         )
         self._thinner = Thinner(config)
-        self._map = LocalMap(config)
+        self._start = start
+        self._map = LocalMap(config, None if start is None else start.known)
         self._imu = ImuSamples.empty()
         self._state: State | None = None
         self._turn_rate = np.zeros(3)
@@ -93,13 +101,17 @@ class InertialOdometry:
 
     @classmethod
     def looking_ahead(
-        cls, config: OdometryConfig, frames: Iterable[SyncedFrame], images: ImageUpdate | None = None
+        cls,
+        config: OdometryConfig,
+        frames: Iterable[SyncedFrame],
+        images: ImageUpdate | None = None,
+        start: Start | None = None,
     ) -> InertialOdometry:
         """For a recording: two frames are registered beforehand to know how fast it begins."""
         trial = LidarOdometry(config)
         for frame in islice(frames, _START_FRAMES):
             trial.track(frame)
-        return cls(config, images, trial.twist[:3])
+        return cls(config, images, trial.twist[:3], start)
 
     @property
     def state(self) -> State | None:
@@ -155,7 +167,16 @@ class InertialOdometry:
         if not still:
             self._count("moving at the start")
             self.instruction = INSTRUCTION
-        return state
+        return state if self._start is None else self._placed(state, self._start)
+
+    def _placed(self, state: State, start: Start) -> State:
+        """The first state in the frame of a known map, whose planes are ready for the first scan."""
+        state = state.moved(start.T_map_world)
+        P = state.P.copy()
+        P[POSITION, POSITION] += _PLACED_M**2 * np.eye(3)
+        P[ROTATION, ROTATION] += _PLACED_RAD**2 * np.eye(3)
+        self._map.begin(np.empty((0, 3), np.float32), state.T_world_body)
+        return replace(state, P=P)
 
     def _by_planes(self, arrived: _Arrived) -> tuple[State, Explained | None]:
         """The state after the LiDAR update, or the prior and None if the scan does not fit the map."""

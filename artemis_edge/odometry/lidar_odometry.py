@@ -15,6 +15,7 @@ from artemis_edge.odometry import imu as inertial
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.aligner import Aligner
 from artemis_edge.odometry.deskew import deskew_frame, window
+from artemis_edge.odometry.known_map import Start
 from artemis_edge.odometry.local_map import LocalMap
 from artemis_edge.odometry.motion import Motion, Prediction
 from artemis_edge.odometry.registration import DEGENERATE, Registration
@@ -43,15 +44,22 @@ class LidarOdometry:
     """Pose of every frame from its scans; world is the first LiDAR frame, levelled (z up) if there is an IMU.
 
     ``lost`` counts by reason the frames that could not be registered and got the predicted pose, and restarts
-    of the map.
+    of the map. ``instruction``: as of ``InertialOdometry``; here nothing needs to be at rest.
     """
 
-    def __init__(self, config: OdometryConfig, start_twist: F64 | None = None) -> None:
-        """``start_twist`` (6,): how the sensor moves during the first scan, where that is known."""
+    instruction: str | None = None
+
+    def __init__(
+        self, config: OdometryConfig, start_twist: F64 | None = None, start: Start | None = None
+    ) -> None:
+        """``start_twist`` (6,): how the sensor moves during the first scan, where that is known; ``start`` to go
+        on in a known map.
+        """
         self.lost: dict[str, int] = {}
         self._config = config
         self._thinner = Thinner(config)
-        self._map = LocalMap(config)
+        self._T_world_first = np.eye(4) if start is None else start.T_map_world
+        self._map = LocalMap(config, None if start is None else start.known)
         self._aligner = Aligner(config, self._map.planes)
         self._motion: Motion | None = None
         self._first: _First | None = None  # until its motion is known
@@ -60,7 +68,9 @@ class LidarOdometry:
         self._start_twist: F64 = np.zeros(6) if start_twist is None else start_twist
 
     @classmethod
-    def looking_ahead(cls, config: OdometryConfig, frames: Iterable[SyncedFrame]) -> LidarOdometry:
+    def looking_ahead(
+        cls, config: OdometryConfig, frames: Iterable[SyncedFrame], start: Start | None = None
+    ) -> LidarOdometry:
         """For a recording: two frames are tried, so that the first is corrected for the motion already.
 
         Without this the first frame goes out as it was measured: its motion is known only after the second.
@@ -68,7 +78,7 @@ class LidarOdometry:
         trial = cls(config)
         for frame in islice(frames, _START_FRAMES):
             trial.track(frame)
-        return cls(config, trial.twist)
+        return cls(config, trial.twist, start)
 
     @property
     def twist(self) -> F64:
@@ -90,7 +100,7 @@ class LidarOdometry:
         if found is None:
             return self._fall_back(frame, scan)
         self._accept(scan, found.T_world_lidar, prediction.twist(found.T_world_lidar))
-        return self._tracked(frame, bool(np.linalg.eigvalsh(found.N)[0] < DEGENERATE))
+        return self._tracked(frame, _unobserved(found))
 
     def _begin(self, frame: SyncedFrame, scan: ThinScan) -> TrackedFrame:
         """The first scan makes the map; an empty one waits for the next."""
@@ -99,7 +109,7 @@ class LidarOdometry:
             return self._tracked(frame)
         T = np.eye(4)
         T[:3, :3] = inertial.levelling(self._imu)
-        self._seed(T, frame.stamp_ns, scan)
+        self._seed(self._T_world_first @ T, frame.stamp_ns, scan)
         return self._tracked(frame)
 
     def _seed(self, T_world_lidar: F64, stamp_ns: int, scan: ThinScan) -> None:
@@ -147,9 +157,12 @@ class LidarOdometry:
             self._lost_in_a_row = 0
         return tracked
 
-    def _tracked(self, frame: SyncedFrame, degenerate: bool = False) -> TrackedFrame:
-        """The frame with the pose that the present motion has at its stamp."""
-        known = self._motion or Motion(np.eye(4), frame.stamp_ns, np.zeros(6))
+    def _tracked(self, frame: SyncedFrame, unobserved: F64 | None = None) -> TrackedFrame:
+        """The frame with the pose that the present motion has at its stamp.
+
+        ``unobserved`` (3,) is the direction in world of which its planes say nothing, where there is one.
+        """
+        known = self._motion or Motion(self._T_world_first, frame.stamp_ns, np.zeros(6))
         since_s = (frame.stamp_ns - known.stamp_ns) * 1e-9
         images_s = [(image.stamp_ns - known.stamp_ns) * 1e-9 for image in frame.images]
         moved = self._during(frame, known, since_s, images_s)
@@ -157,7 +170,15 @@ class LidarOdometry:
         T = known.T_world_lidar @ moved.at(since_s)
         at_images = tuple(known.T_world_lidar @ moved.at(t) for t in images_s)
         return TrackedFrame(
-            frame.index, frame.stamp_ns, T, scans, degenerate, frame.images, at_images, known.twist
+            frame.index,
+            frame.stamp_ns,
+            T,
+            scans,
+            unobserved is not None,
+            frame.images,
+            at_images,
+            known.twist,
+            unobserved,
         )
 
     @staticmethod
@@ -169,3 +190,12 @@ class LidarOdometry:
 
     def _count(self, reason: str, number: int = 1) -> None:
         self.lost[reason] = self.lost.get(reason, 0) + number
+
+
+def _unobserved(found: Registration) -> F64 | None:
+    """Unit vector (3,) in world along which the planes hardly tell the place, or None."""
+    values, vectors = np.linalg.eigh(found.N)
+    if values[0] >= DEGENERATE:
+        return None
+    direction: F64 = found.T_world_lidar[:3, :3] @ vectors[:, 0]
+    return direction

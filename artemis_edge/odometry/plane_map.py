@@ -86,8 +86,11 @@ class PlaneMap:
             refused = max(refused, int(left_out))
         return refused
 
-    def evict(self, centre: F64, radius_m: float) -> None:
-        """Forget voxels farther than the radius from a place in world, farther still until half is free."""
+    def evict(self, centre: F64, radius_m: float) -> float:
+        """Forget voxels farther than the radius from a place in world, nearer ones too until half is free.
+
+        Returns the radius that is kept.
+        """
         keep = nearby(self.table.keys[: self._used], centre, radius_m, self.voxel_m)
         while np.count_nonzero(keep) > self.capacity // 2:
             radius_m *= _SHRINK
@@ -95,6 +98,7 @@ class PlaneMap:
         if not keep.all():
             self.table.hash.fill(EMPTY)
             self._used = int(compact(self.table, keep))
+        return radius_m
 
     def level_of(self, size_m: float) -> int:
         """The finest level whose voxels are not smaller than a size, or the coarsest."""

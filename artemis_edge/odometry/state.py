@@ -95,6 +95,20 @@ class State:
         error[CAMERAS + 1 :: _PER_CAMERA] = self.image_delay_s - other.image_delay_s
         return error
 
+    def moved(self, T_new_old: F64) -> State:
+        """The same state in another world frame; T_new_old (4, 4)."""
+        R = T_new_old[:3, :3]
+        J = np.eye(len(self))
+        for part in (POSITION, VELOCITY, GRAVITY):
+            J[part, part] = R
+        return replace(
+            self,
+            T_world_body=se3.orthonormal(T_new_old @ self.T_world_body),
+            velocity=R @ self.velocity,
+            gravity=R @ self.gravity,
+            P=J @ self.P @ J.T,
+        )
+
     def with_camera(self, name: str, exposure_sigma: float, delay_sigma_s: float) -> State:
         """The state with another camera, exposure as in its first image (sigma of the log) and no delay."""
         n = len(self)

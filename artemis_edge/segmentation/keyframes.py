@@ -184,6 +184,17 @@ def read_keyframes(map_folder: Path) -> list[Keyframe]:
     )
 
 
+def photographs(map_folder: Path) -> Iterator[tuple[CameraImage, F64]]:
+    """The photographs of a map, whole, in a frame of their own, and T_world_cam (4, 4); none where none were kept."""
+    try:
+        kept = read_keyframes(map_folder)
+    except InputError:
+        return
+    for k in kept:
+        if k.file.is_file():
+            yield CameraImage(k.camera, k.stamp_ns, k.file.read_bytes(), k.model, np.eye(4)), k.T_world_cam
+
+
 def _keyframe(folder: Path, row: dict[str, Any]) -> Keyframe:
     path = folder / str(row["file"])
     T_cam_world = np.array(row["T_cam_world"], np.float64)

@@ -238,7 +238,7 @@ class Daemon:
                 for h in self.capture.health()
             },
         }
-        session = LiveSession(self.config, folder, self.outlet, self._tell, about)
+        session = LiveSession(self.config, folder, self.outlet, self._tell, about, go_on)
         session.begin()
         self.session = session
         self._become(Phase.RECORDING)

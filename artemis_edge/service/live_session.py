@@ -36,14 +36,21 @@ class LiveSession:
     """``begin`` it, ``turn`` often, ``end`` it, ``turn`` until it is ``over``. ``fault`` is a sentence, or empty."""
 
     def __init__(
-        self, config: RunConfig, folder: Path, outlet: Outlet, tell: Tell, about: dict[str, Any]
+        self,
+        config: RunConfig,
+        folder: Path,
+        outlet: Outlet,
+        tell: Tell,
+        about: dict[str, Any],
+        go_on: bool = False,
     ) -> None:
+        """``go_on``: its map continues the one that the folder has, if any."""
         self.config, self.folder, self.outlet = config, folder, outlet
         self.fault = ""
         self.begun_s = time.monotonic()
         self.ended_s: float | None = None
         self.recorder_restarts = self.mapper_restarts = 0
-        self._tell, self._about = tell, about
+        self._tell, self._about, self._go_on = tell, about, go_on
         self._first = self._stop_at = 0
         self._out = folder / RESULT
         self._adopted: set[int] = set()
@@ -140,6 +147,7 @@ class LiveSession:
             self.config.service.checkpoint_s,
             str(viewers_path(control_path(self.config.service.socket))),
             int(self.config.service.socket_mode, 8),
+            str(self.folder) if self._go_on else "",
         )
         child = Child("artemis_edge.service.mapper", [self.outlet.ring.descriptor], task, _MAPPING_NICE)
         if self.ended_s is not None:

@@ -24,19 +24,23 @@ from msgspec import Struct
 
 from artemis_edge import health
 from artemis_edge.config import Config, from_toml
+from artemis_edge.continuing import find_earlier
 from artemis_edge.errors import UserError
+from artemis_edge.loop.relocate import Found
 from artemis_edge.service.checkpoint import Checkpoints
 from artemis_edge.service.map_feed import MapFeed
 from artemis_edge.session.feed import LiveFeed
 from artemis_edge.session.line_channel import LineChannel
-from artemis_edge.session.message_ring import MessageRing
+from artemis_edge.session.message_ring import MessageRing, Sent
 from artemis_edge.session.results import prepare, scratch
 from artemis_edge.session.stream_mapping import StreamMapping, warm_up
+from artemis_edge.session.stream_search import StreamSearch
 
 _POLL_S = 0.005
 _SAY_S = 0.25
 _COLLECT_EVERY = 100  # frames
 _LATEST = 50  # frames that times are told of
+_EARLY = 300  # frames after which it is too late to hold still at the start
 _PR_SET_PDEATHSIG = 1
 
 
@@ -44,6 +48,7 @@ class MapperTask(Struct, frozen=True):
     """What the service tells the mapping: ``config`` as TOML, the session's folder, where the map goes.
 
     ``viewers`` is the path of the socket for viewers of the growing mesh (empty: none), with its file mode.
+    ``earlier`` is where a map may be that this one is to continue (empty: none).
     """
 
     folder: str
@@ -53,6 +58,7 @@ class MapperTask(Struct, frozen=True):
     checkpoint_s: float = 20.0
     viewers: str = ""
     viewers_mode: int = 0o600
+    earlier: str = ""
 
 
 class LiveMapper:
@@ -67,6 +73,8 @@ class LiveMapper:
         self.mapping.before = self.checkpoints.working_on
         self._config, self._pages = config, pages
         self.viewers = MapFeed(Path(task.viewers), task.viewers_mode) if task.viewers else None
+        self._ring = ring
+        self._search = self._searching(config)
         self._stop_at: int | None = None
         self._checked = time.monotonic()
         self._said = 0.0
@@ -90,9 +98,34 @@ class LiveMapper:
             if sent is None:
                 time.sleep(_POLL_S)
                 self._tend()
+            elif self._search is not None:
+                self._look(self._search, sent)
             elif self.mapping.take(sent):
                 self.checkpoints.working_on(-1)
                 self._after_frame()
+            if self._search is not None and self._stop_at is not None and self.feed.next >= self._stop_at:
+                self._begin(self._search, self._search.last_look())
+
+    def _searching(self, config: Config) -> StreamSearch | None:
+        earlier = find_earlier(Path(self.task.earlier), config) if self.task.earlier else None
+        return None if earlier is None else StreamSearch(config, earlier)
+
+    def _look(self, search: StreamSearch, sent: Sent) -> None:
+        """Look for the place in the map that is continued; then map from the first message on."""
+        found = search.take(sent)
+        if found is not None or search.given_up:
+            self._begin(search, found)
+        self._tend()
+
+    def _begin(self, search: StreamSearch, found: Found | None) -> None:
+        """Map from the first message on: in the map that is continued, or on its own."""
+        if found is None:
+            search.given_up = True
+            self.mapping.statistics.notes.append(search.sentence())
+        else:
+            self.mapping.go_on_in(search.earlier, found, search.first_ns or 0)
+        self._search = None
+        self.feed = LiveFeed(self._ring, Path(self.task.folder), self.task.first)
 
     def save(self) -> dict[str, Any]:
         """The map and all results."""
@@ -145,6 +178,7 @@ class LiveMapper:
     def status(self) -> dict[str, Any]:
         """How it does."""
         statistics, feed = self.mapping.statistics, self.feed
+        tracked = self.mapping.mapper.tracked
         times = statistics.frame_ms[-_LATEST:]
         pose = self.mapping.mapper.trajectory[-1][1] if self.mapping.mapper.trajectory else np.eye(4)
         return {
@@ -161,12 +195,21 @@ class LiveMapper:
             "pose": [round(float(v), 4) for v in pose[:3].ravel()],
             "lost": {**statistics.lost, **self.mapping.assembler.lost},
             "fault": self.mapping.fault,
+            "degenerate": bool(tracked is not None and tracked.degenerate),
+            "coaching": self._coaching(),
             "deaths": self.checkpoints.deaths,
             "checkpoint_s": round(time.monotonic() - self._checked, 1),
             "fork_ms": round(self.checkpoints.fork_ms, 1),
             "rss_mb": round(health.resident_mb(), 1),
             "cpu_s": round(time.process_time(), 2),
         }
+
+    def _coaching(self) -> list[str]:
+        """What the operator should do now."""
+        search = [] if self._search is None else [self._search.sentence()]
+        early = len(self.mapping.statistics.frame_ms) < _EARLY
+        said = self.mapping.odometry.instruction
+        return [*search, *self.mapping.statistics.notes, *([said] if said is not None and early else [])]
 
 
 class ServiceGoneError(Exception):

@@ -58,6 +58,8 @@ class StatusView:
             frame_ms=mapping.get("frame_ms_list", []),
             disk_minutes=state["disk"]["minutes_left"],
             overload=_overload(mapping, recorder),
+            degenerate=bool(mapping.get("degenerate", False)),
+            coaching=list(mapping.get("coaching", [])),
             losses={**state["lost"], **mapping.get("lost", {})},
             queries=[
                 QueryStatus(text, "unsupported", note="asked when the map is finished")

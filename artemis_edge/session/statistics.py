@@ -26,7 +26,8 @@ class RunStatistics:
     frame; neither is in ``frame_ms``, but ``flush_cpu_ms`` is part of the mean CPU time.
     ``frames_dropped`` were in the input and are not in the map, ``lost`` says what and why, by
     reason. ``input_hz`` 0 when the input has no rate. ``peak_rss_mb`` is measured when the report is
-    written unless it is set.
+    written unless it is set. ``continued`` says which map was continued and where in it, ``notes`` are sentences of
+    the odometry for whoever made the recording.
     """
 
     input_name: str = ""
@@ -43,6 +44,8 @@ class RunStatistics:
     map_bytes: int = 0
     kept_bytes: int = 0
     config_toml: str = ""
+    continued: Mapping[str, Any] | None = None
+    notes: list[str] = field(default_factory=list)
 
     def add_frame(self, frame_ms: float, cpu_ms: float, stage_ms: Mapping[str, float]) -> None:
         """One frame is done. A stage that did not run in every frame has fewer entries."""
@@ -76,6 +79,8 @@ class RunStatistics:
             "kept_bytes": self.kept_bytes,
             "realtime_factor": self._realtime_factor(),
             "input_hz": round(self.input_hz, _DIGITS),
+            **({} if self.continued is None else {"continued": dict(self.continued)}),
+            **({"notes": self.notes} if self.notes else {}),
             "versions": versions(),
         }
 

@@ -13,10 +13,12 @@ import numpy as np
 
 from artemis_edge import health, topics
 from artemis_edge.config import Config, to_toml
+from artemis_edge.continuing import EarlierMap
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.exclusion import Zones
 from artemis_edge.frames import MeshDelta, SyncedFrame, Trajectory
 from artemis_edge.keeper import Keeper
+from artemis_edge.loop.relocate import Found
 from artemis_edge.mapping_run import Mapper
 from artemis_edge.runtime import MakeMapper, pipeline, with_tiny_map, write_results
 from artemis_edge.session.assembly import FrameAssembler
@@ -65,6 +67,12 @@ class StreamMapping:
         self.delta: MeshDelta | None = None  # of the latest frame
         self.before: Callable[[int], None] = lambda index: None
 
+    def go_on_in(self, earlier: EarlierMap, found: Found, first_ns: int) -> None:
+        """Before the first message: begin with a map made before, in which the stream was recognised."""
+        self.odometry.start = earlier.start(found)
+        self.statistics.continued = earlier.account(found, first_ns)
+        earlier.into(self.mapper, self.keeper)
+
     def take(self, sent: Sent) -> bool:
         """Whether the message completed a frame. A frame that cannot be mapped is counted and skipped."""
         frame = self.assembler.take(sent)
@@ -89,6 +97,7 @@ class StreamMapping:
         self.statistics.flush_cpu_ms = (time.process_time_ns() - cpu) / _NS_PER_MS
         self.statistics.add_lost(self.assembler.lost)
         self.statistics.add_lost(self.mapper.lost)
+        self.statistics.notes += [self.odometry.instruction] if self.odometry.instruction else []
         found = self.odometry.lost.items()
         self.statistics.add_lost({f"odometry_{reason.replace(' ', '_')}": n for reason, n in found})
         results = Results(out)

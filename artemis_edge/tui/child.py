@@ -244,6 +244,8 @@ class WatchedPipeline(Pipeline):
                 vertices=int(counter[2]), triangles=int(counter[3]), resident_mb=health.resident_mb()
             ),
             message="",
+            degenerate=self.tracked is not None and self.tracked.degenerate,
+            coaching=[said] if (said := getattr(self.odometry, "instruction", None)) is not None else [],
         )
 
 
