@@ -238,39 +238,24 @@ def write_speed(folder: Path) -> float:
 
 def battery(folder: Path = Path("/sys/class/power_supply")) -> Finding:
     """What is left."""
-    for supply in sorted(folder.glob("*")):
-        with contextlib.suppress(OSError, ValueError):
-            if (supply / "type").read_text().strip() != "Battery":
-                continue
-            share = int((supply / "capacity").read_text())
-            minutes = _minutes(supply)
-            left = f", {minutes:.0f} minutes at this load" if minutes is not None else ""
-            low = share < _LOW_BATTERY
-            return Finding(
-                "battery", "warn" if low else "ok", f"{share} %{left}" + ("; charge it" if low else "")
-            )
-    return Finding("battery", "ok", "none that this system knows of")
-
-
-def _minutes(supply: Path) -> float | None:
-    for now, flow in (("energy_now", "power_now"), ("charge_now", "current_now")):
-        with contextlib.suppress(OSError, ValueError):
-            drain = abs(int((supply / flow).read_text()))
-            return int((supply / now).read_text()) / drain * 60 if drain else None
-    return None
+    found = health.battery(folder)
+    if found is None:
+        return Finding("battery", "ok", "none that this system knows of")
+    left = f", {found.minutes:.0f} minutes at this load" if found.minutes is not None else ""
+    low = found.percent < _LOW_BATTERY
+    return Finding(
+        "battery", "warn" if low else "ok", f"{found.percent:.0f} %{left}" + ("; charge it" if low else "")
+    )
 
 
 def temperature(folder: Path = Path("/sys/class/thermal")) -> Finding:
     """The hottest place, as the kernel knows it."""
-    readings = []
-    for zone in folder.glob("thermal_zone*/temp"):
-        with contextlib.suppress(OSError, ValueError):
-            readings.append(int(zone.read_text()) / 1000)
-    if not readings:
+    hottest = health.temperature_c(folder)
+    if hottest is None:
         return Finding("temperature", "ok", "not told by this system")
-    hot = max(readings) >= _HOT_C
+    hot = hottest >= _HOT_C
     return Finding(
-        "temperature", "warn" if hot else "ok", f"{max(readings):.0f} C" + ("; let it cool" if hot else "")
+        "temperature", "warn" if hot else "ok", f"{hottest:.0f} C" + ("; let it cool" if hot else "")
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -172,8 +173,11 @@ def copy_triangles(store: Store, voxels: I32, triangles: I64) -> None:
 
 
 @kernel
-def copy_labels(store: Store, cells: I32, label: U8) -> None:
-    """Most probable class of the vertices in ``cells``; 0 where no image saw them."""
+def copy_labels(store: Store, cells: I32, active: U8, label: U8, probability: U8) -> None:
+    """Most probable class of the vertices in ``cells`` and its probability; 0 where no image saw them or none is there.
+
+    The softmax is over the ``active`` slots: others would be background once more.
+    """
     for i in range(cells.shape[0]):
         row = store.attribute[cells[i]]
         best = 0
@@ -181,13 +185,21 @@ def copy_labels(store: Store, cells: I32, label: U8) -> None:
             if row[LOG_CLASS + c] > row[LOG_CLASS + best]:
                 best = c
         label[i] = best
+        probability[i] = 0
+        if best > 0:
+            total = 0.0
+            for c in range(CLASSES):
+                if active[c]:
+                    total += math.exp(row[LOG_CLASS + c] - row[LOG_CLASS + best])
+            probability[i] = int(255.0 / max(total, 1.0) + 0.5)
 
 
 class Outbox:
-    """Hands out the blocks that changed."""
+    """Hands out the blocks that changed; ``active`` uint8 (CLASSES,) are the slots in use, None without classes."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, active: U8 | None = None) -> None:
         self._store = store
+        self._active = active
         self._listing = new_listing(store)
         self._turn = AGAIN_AFTER
         # By slot: turn when a block was told last, and since when it has something to tell, 0 when it has not. A
@@ -216,11 +228,11 @@ class Outbox:
         self._since[slots] = 0
         self._told[slots] = self._turn
         self._turn += 1
-        return to_delta(index, self._store, slots, self._listing)
+        return to_delta(index, self._store, slots, self._listing, self._active)
 
 
-def to_delta(index: int, store: Store, slots: I32, listing: Listing) -> MeshDelta:
-    """Resident blocks as a ``MeshDelta``: only living vertices."""
+def to_delta(index: int, store: Store, slots: I32, listing: Listing, active: U8 | None = None) -> MeshDelta:
+    """Resident blocks as a ``MeshDelta``: only living vertices. ``active`` as in :class:`Outbox`."""
     voxel_start, vertex_start, triangle_start = np.empty((3, len(slots) + 1), np.int64)
     list_voxels(store, slots, listing.voxel, voxel_start)
     list_cells(store, listing, voxel_start, vertex_start)
@@ -239,11 +251,12 @@ def to_delta(index: int, store: Store, slots: I32, listing: Listing) -> MeshDelt
         label=np.zeros(n, np.uint8),
         confidence=np.empty(n, np.float32),
         triangles=np.empty((int(triangle_start[-1]), 3), np.int64),
+        probability=np.zeros(0 if active is None else n, np.uint8),
     )
     copy_vertices(store, listing.cell[:n], delta.position, delta.normal, delta.confidence)
     read_colours(store, listing.cell[:n], delta.colour)
     sureness(delta.confidence)
-    if store.attribute.shape[1] > LOG_CLASS:
-        copy_labels(store, listing.cell[:n], delta.label)
+    if active is not None:
+        copy_labels(store, listing.cell[:n], active, delta.label, delta.probability)
     copy_triangles(store, listing.voxel[: voxel_start[-1]], delta.triangles)
     return delta

@@ -184,7 +184,8 @@ class MeshDelta:
     ``vertex_start[k]:vertex_start[k + 1]`` of the vertex arrays belong to block k, and likewise triangles.
     ``triangles`` int64 (t, 3) holds global vertex ids (a triangle may use a neighbour block's vertex);
     ``vertex_id`` int64 (v,), ``position`` and ``normal`` float32 (v, 3) in world, ``colour`` uint8 (v, 3),
-    ``label`` uint8 (v,), ``confidence`` float32 (v,) 0..1.
+    ``label`` uint8 (v,), ``confidence`` float32 (v,) 0..1. ``probability`` uint8 (v,) is that of the label, 255 is 1,
+    0 for background; empty where the map has no classes.
     """
 
     index: int
@@ -198,3 +199,4 @@ class MeshDelta:
     label: U8
     confidence: F32
     triangles: I64
+    probability: U8 = field(default_factory=lambda: np.empty(0, np.uint8))

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import os
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 MB = 1e6
@@ -53,6 +54,48 @@ def free_disk_mb(folder: Path) -> float:
     while not place.exists():
         place = place.parent
     return shutil.disk_usage(place).free / MB
+
+
+@dataclass(frozen=True, slots=True)
+class Battery:
+    """``percent`` left, ``minutes`` at this load where the system tells the flow; ``charging`` or full at a supply."""
+
+    percent: float
+    minutes: float | None
+    charging: bool
+
+
+def battery(folder: Path = Path("/sys/class/power_supply")) -> Battery | None:
+    """The first battery that the system knows of."""
+    for supply in sorted(folder.glob("*")):
+        with contextlib.suppress(OSError, ValueError):
+            if (supply / "type").read_text().strip() == "Battery":
+                percent = float((supply / "capacity").read_text())
+                return Battery(percent, _minutes(supply), _status(supply) in ("Charging", "Full"))
+    return None
+
+
+def _status(supply: Path) -> str:
+    with contextlib.suppress(OSError):
+        return (supply / "status").read_text().strip()
+    return ""
+
+
+def _minutes(supply: Path) -> float | None:
+    for now, flow in (("energy_now", "power_now"), ("charge_now", "current_now")):
+        with contextlib.suppress(OSError, ValueError):
+            drain = abs(int((supply / flow).read_text()))
+            return int((supply / now).read_text()) / drain * 60 if drain else None
+    return None
+
+
+def temperature_c(folder: Path = Path("/sys/class/thermal")) -> float | None:
+    """The hottest place that the kernel knows of, degrees Celsius; None where it tells of none."""
+    readings = []
+    for zone in folder.glob("thermal_zone*/temp"):
+        with contextlib.suppress(OSError, ValueError):
+            readings.append(int(zone.read_text()) / 1000)
+    return max(readings, default=None)
 
 
 def _proc_field(file: Path, name: str) -> float:

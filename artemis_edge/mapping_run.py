@@ -21,6 +21,7 @@ from artemis_edge.frames import F32, F64, FrameSource, MeshDelta, SyncedFrame, T
 from artemis_edge.paging import Page
 from artemis_edge.progress import Report, say
 from artemis_edge.refinement.photographs import Waiting
+from artemis_edge.session.load import Load
 from artemis_edge.session.results import disk_sentence
 from artemis_edge.session.statistics import RunStatistics
 
@@ -68,6 +69,14 @@ class Mapper(Protocol):
 
     def finish(self) -> MeshDelta | None:
         """Work that was postponed."""
+        ...
+
+    def ask(self, slots: Mapping[int, str]) -> None:
+        """Which class each slot of the map holds from the next frame on; of a mapper with a segmenter only."""
+        ...
+
+    def reduce(self, load: Load) -> None:
+        """How much may be done from the next frame on."""
         ...
 
     def tell_everything(self) -> None:

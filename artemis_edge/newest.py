@@ -62,4 +62,5 @@ def joined(parts: list[tuple[MeshDelta, int]]) -> MeshDelta:
         label=rows("label", vertices),
         confidence=rows("confidence", vertices),
         triangles=rows("triangles", triangles),
+        probability=rows("probability", vertices),
     )

@@ -6,7 +6,7 @@ A page names cells by their place in the block, so it means the same wherever th
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -413,12 +413,17 @@ def with_attributes(page: Page, columns: int) -> Page:
 
 
 class PageFile:
-    """Blocks on disk: an append-only file and the place of each block's newest page in it."""
+    """Blocks on disk: an append-only file and the place of each block's newest page in it.
+
+    ``mend`` are changes to the whole map that pages of before them still need, in their order: each is made when the
+    page is read.
+    """
 
     def __init__(self, folder: Path) -> None:
+        self.mend: list[Callable[[Page], Page]] = []
         self._path = folder / "pages.bin"
         self._file: BinaryIO | None = None
-        self._place: dict[int, tuple[int, int]] = {}
+        self._place: dict[int, tuple[int, int, int]] = {}
         self._end = 0
 
     def __len__(self) -> int:
@@ -439,15 +444,18 @@ class PageFile:
         data = page_bytes(page)
         self._file.seek(self._end)
         self._file.write(data)
-        self._place[key] = (self._end, len(data))
+        self._place[key] = (self._end, len(data), len(self.mend))
         self._end += len(data)
 
     def get(self, key: int) -> Page:
         """The newest page of a block."""
         assert self._file is not None
-        at, size = self._place[key]
+        at, size, mended = self._place[key]
         self._file.seek(at)
-        return page_from_bytes(self._file.read(size))
+        page = page_from_bytes(self._file.read(size))
+        for mend in self.mend[mended:]:
+            page = mend(page)
+        return page
 
     def take(self, key: int) -> Page:
         """The page of a block that becomes resident again."""

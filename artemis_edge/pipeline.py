@@ -22,6 +22,7 @@ from artemis_edge.refinement.photographs import Waiting
 from artemis_edge.refinement.stage import Refinement
 from artemis_edge.semantic_constraint import SemanticConstraint
 from artemis_edge.semantic_map import Segmenter, SemanticMap
+from artemis_edge.session.load import Load
 from artemis_edge.visibility import FreeSpace
 from artemis_edge.voxel_map import VoxelMap
 
@@ -49,7 +50,8 @@ class Pipeline:
         self.pager = Pager(self.voxel_map.store, page_folder, self.refinement.pages)
         self.constraint = self._constraint()
         self.mesher = Mesher(config.mesher, self.voxel_map, self.pager.prepare, self.constraint)
-        self.outbox = Outbox(self.voxel_map.store)
+        active = None if self.semantics is None else self.semantics.active
+        self.outbox = Outbox(self.voxel_map.store, active)
         self.tracked: TrackedFrame | None = None
         self.trajectory: list[tuple[int, F64]] = []
         self.stage_ms: dict[str, float] = {}
@@ -88,6 +90,22 @@ class Pipeline:
             self.pager.make_room(self._stamp)
         self.trajectory.append((tracked.stamp_ns, tracked.T_world_lidar))
         return delta
+
+    def ask(self, slots: Mapping[int, str]) -> None:
+        """Which class each slot of the map holds from the next frame on; what it knew of others is taken back.
+
+        Of a pipeline with a segmenter only.
+        """
+        assert self.semantics is not None
+        forgotten = self.semantics.assign(slots, self._stamp)
+        if forgotten is not None:
+            self.pager.file.mend.append(forgotten)
+
+    def reduce(self, load: Load) -> None:
+        """How much may be done from the next frame on; less where the machine is overloaded."""
+        self.refinement.share = load.texture_share
+        if self.constraint is not None:
+            self.constraint.most_sweeps = load.most_sweeps
 
     def tell_everything(self) -> None:
         """A viewer is new: all blocks in memory are told again, as the coming frames have room."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -150,6 +150,14 @@ def reprocess(
     told = [*source.warnings, *statistics.notes, *_skipped(run, statistics)]
     warnings = [*told, *mapper.warnings, *answering.warnings]
     return Outcome(request.out, outcome or {}, statistics, run.trajectory(), warnings)
+
+
+class Answers(Protocol):
+    """What knows the questions that a finished map is to answer."""
+
+    def replies(self, mesh: Mesh, mapper: Mapper) -> list[Reply]:
+        """One for each question."""
+        ...
 
 
 class Answering:
@@ -342,7 +350,7 @@ def write_results(
     photos: HeldOut,
     statistics: RunStatistics,
     evaluate: Evaluate | None,
-    answering: Answering | None = None,
+    answering: Answers | None = None,
     stage: Callable[[str], None] = unheard,
 ) -> dict[str, Any] | None:
     """All results, small ones first; returns the report. ``stage`` is told what comes next."""

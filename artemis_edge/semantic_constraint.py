@@ -105,6 +105,7 @@ class SemanticConstraint:
         self, config: SemanticsConfig, store: Store, cell_m: float, sigma_m: float, active: U8
     ) -> None:
         self._store, self._active, self._sweeps = store, active, config.sweeps
+        self.most_sweeps = config.sweeps  # the overload control lowers it
         self.energy = Energy(
             config.lambda_sem,
             config.lambda_smooth,
@@ -137,13 +138,18 @@ class SemanticConstraint:
             )
 
     def settle(self, batch: I32, stamp: int) -> None:
-        """Move the vertices of the voxels ``batch``, which were just placed by their evidence."""
+        """Move the vertices of the voxels ``batch``, which were just placed by their evidence.
+
+        Nothing moves while no class is asked for.
+        """
+        if not self._active[1:].any():
+            return
         room = int(count_cells(self._store, batch))
         if room > len(self._anchor):
             self._anchor = np.empty((2 * room, 8), np.float32)
         first = np.empty(len(batch), np.int32)
         keep_anchors(self._store, batch, first, self._anchor)
-        for _ in range(self._sweeps):
+        for _ in range(min(self._sweeps, self.most_sweeps)):
             sweep(self._store, batch, first, self._anchor, self.energy, self._active, self._space)
         if self.energy.lambda_sem > 0.0:
             slide(self._store, batch, first, self._anchor, self.energy, self._active, self._space)

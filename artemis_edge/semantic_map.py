@@ -6,7 +6,7 @@ Holds which class is in which slot and the scratch memory; the mathematics is in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,11 +16,22 @@ from artemis_edge.block_store import CLASSES, LOG_CLASS, WEIGHT, Store
 from artemis_edge.class_rows import CLEAR_LOG
 from artemis_edge.config import SemanticsConfig
 from artemis_edge.errors import InputError
+from artemis_edge.forgetting import Forgotten, forget_blocks
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraImage
 from artemis_edge.paging import resident_blocks
 from artemis_edge.refinement.semantics import labels_of, refine
 from artemis_edge.segmentation.backend import DenseScores
-from artemis_edge.sight import Seen, Sight, compare_depth, look, new_seen, new_sight, splat_depth
+from artemis_edge.sight import (
+    Seen,
+    Sight,
+    compare_depth,
+    empty_depth,
+    look,
+    new_seen,
+    new_sight,
+    splat_depth,
+    without_depth,
+)
 from artemis_edge.trajectory import inverse
 from artemis_edge.voxel_fusion import fuse, grid_of, sample_scores, start_from
 
@@ -84,6 +95,28 @@ class SemanticMap:
         self.active[:] = 0
         self.active[: len(names) + 1] = 1
 
+    def assign(self, slots: Mapping[int, str], stamp: int) -> Forgotten | None:
+        """Which class each slot holds from now on (background apart).
+
+        What the map knew of classes that are gone is taken back; returns what pages on disk still need, None where
+        nothing is gone.
+        """
+        gone = np.zeros(CLASSES, np.uint8)
+        gone[[s for s, name in self.names.items() if s and slots.get(s) != name]] = 1
+        self.names = {0: BACKGROUND} | dict(sorted(slots.items()))
+        self.active[:] = active_slots(self.names)  # in place: others hold it
+        if not gone.any():
+            return None
+        forgotten = Forgotten(gone, self.active.copy())
+        blocks = self._blocks[: resident_blocks(self.store, self._blocks)]
+        forget_blocks(self.store, blocks, gone, forgotten.active, stamp)
+        return forgotten
+
+    @property
+    def asked(self) -> bool:
+        """Whether any class is looked for."""
+        return len(self.names) > 1
+
     def slots_of(self, names: Sequence[str]) -> U8:
         """Which slots hold one of the classes, uint8 (CLASSES,)."""
         out = np.zeros(CLASSES, np.uint8)
@@ -91,8 +124,10 @@ class SemanticMap:
         return out
 
     def sight(self, image: CameraImage, T_world_lidar: F64) -> Sight:
-        """The view of an image with the reference depth that the map has now."""
+        """The view of an image with the reference depth that the map has now; without one where nothing is asked."""
         view = new_sight(image.model, T_world_lidar @ inverse(image.T_cam_lidar))
+        if not self.asked:
+            return without_depth(view)
         n = self._look(view)
         splat_depth(self._seen, n, view.lens[0], self._spacing_m, view.depth)
         return view
@@ -100,7 +135,13 @@ class SemanticMap:
     def fuse(self, mask: LateMask, stamp: int) -> int:
         """Voxel fusion (eq. 1) of a mask; returns how many vertices it sees."""
         n = self._look(mask.sight)
-        compare_depth(self._seen, n, mask.sight.depth)
+        depth = mask.sight.depth
+        if (
+            depth.size == 0
+        ):  # an image from before the question: what stood in its way is what the map knows now
+            depth = empty_depth(mask.sight.lens)
+            splat_depth(self._seen, n, mask.sight.lens[0], self._spacing_m, depth)
+        compare_depth(self._seen, n, depth)
         sampled = self._rows(n, mask.scores)
         sample_scores(self._seen, n, mask.scores.score, grid_of(mask.scores), sampled)
         fuse(

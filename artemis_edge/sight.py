@@ -70,10 +70,18 @@ def new_sight(camera: CameraModel, T_world_cam: F64) -> Sight:
     lens[11] = min(fold_radius(lens[4:9]) ** 2, 1e6)
     u, v = np.array([0.0, camera.width - 1]), np.array([0.0, camera.height - 1])
     tangent = np.array([*(u - camera.cx) / camera.fx, *(v - camera.cy) / camera.fy]) * _FRUSTUM_MARGIN
-    shape = (-(-camera.height // DEPTH_SHARE), -(-camera.width // DEPTH_SHARE))
-    return Sight(
-        np.ascontiguousarray(inverse(T_world_cam)[:3]), lens, tangent, np.full(shape, np.inf, np.float32)
-    )
+    return Sight(np.ascontiguousarray(inverse(T_world_cam)[:3]), lens, tangent, empty_depth(lens))
+
+
+def empty_depth(lens: F64) -> F32:
+    """A depth map for a ``Sight.lens`` in which nothing is known."""
+    width, height = int(lens[9]), int(lens[10])
+    return np.full((-(-height // DEPTH_SHARE), -(-width // DEPTH_SHARE)), np.inf, np.float32)
+
+
+def without_depth(sight: Sight) -> Sight:
+    """The view alone: some hundred bytes, of which thousands can be kept."""
+    return sight._replace(depth=np.empty((0, 0), np.float32))
 
 
 def look(store: Store, sight: Sight, blocks: I32, block_m: float, reach_m: float, seen: Seen) -> int:

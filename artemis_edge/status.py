@@ -25,9 +25,10 @@ class Stream(Struct, frozen=True):
 
 
 class QueryStatus(Struct, frozen=True):
-    """A live question: ``status`` searching, matched, approximate, unsupported or not found.
+    """A live question: ``status`` waiting, searching, matched, approximate, unsupported or not found.
 
-    ``labels`` are those of the vertices that are highlighted for it.
+    ``labels`` are those of the vertices that are highlighted for it: all of them, or where there are ``boxes`` those
+    inside: centre x, y, z, size along, across and up, yaw.
     """
 
     text: str
@@ -38,6 +39,7 @@ class QueryStatus(Struct, frozen=True):
     note: str = ""
     places: list[tuple[float, float, float]] = []
     labels: list[int] = []
+    boxes: list[list[float]] = []
 
 
 class SyncStatus(Struct, frozen=True):

@@ -30,6 +30,9 @@ EVENTS = Topic("/artemis/events", "std_msgs/msg/String", 0.0)
 CLOCKS = Topic("/artemis/clocks", "std_msgs/msg/String", 1.0)
 HEALTH = Topic("/artemis/health", "std_msgs/msg/String", 1.0)
 LOST = Topic("/artemis/lost", "std_msgs/msg/String", 0.0)
+QUESTIONS = Topic("/artemis/questions", "std_msgs/msg/String", 0.0)
+MASKS = Topic("/artemis/masks", "artemis_msgs/msg/Mask", 5.0)
+OVERLOAD = Topic("/artemis/overload", "std_msgs/msg/String", 0.0)
 CAMERA_STAMP = Topic("/camera/frame_stamp", "std_msgs/msg/String", 10.0)
 LIDAR_PACKETS = Topic("/lidar/packets", "artemis_msgs/msg/RawPackets", 10.0)
 IMU_BYTES = Topic("/imu/bytes", "artemis_msgs/msg/RawPackets", 10.0)
@@ -56,6 +59,9 @@ TOPICS = (
     CLOCKS,
     HEALTH,
     LOST,
+    QUESTIONS,
+    MASKS,
+    OVERLOAD,
     CAMERA_STAMP,
     LIDAR_PACKETS,
     IMU_BYTES,

@@ -10,6 +10,7 @@ import pytest
 
 from artemis_edge.export.ply import Mesh, bare_mesh, write_ply
 from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
+from artemis_edge.session.load import Load
 
 
 class FakeMapper:
@@ -51,6 +52,12 @@ class FakeMapper:
 
     def finish(self) -> None:
         self.finished = True
+
+    def ask(self, slots: Mapping[int, str]) -> None:
+        self.slots = dict(slots)
+
+    def reduce(self, load: Load) -> None:
+        self.load = load
 
     def tell_everything(self) -> None:
         pass

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from artemis_edge.frames import CameraModel
+from artemis_edge.frames import U8, CameraModel
 from artemis_edge.session.writer import SessionWriter
 
 SECOND = 10**9
@@ -29,10 +29,14 @@ def room(rng: np.random.Generator, count: int) -> np.ndarray:
     return points
 
 
-def write(path: Path, frames: int = 20, points: int = 4000, camera: bool = True) -> Path:
-    """The session at ``path`` (a folder)."""
+def write(
+    path: Path, frames: int = 20, points: int = 4000, camera: bool = True, photograph: U8 | None = None
+) -> Path:
+    """The session at ``path`` (a folder); ``photograph`` is what the camera sees, BGR, else noise."""
     rng = np.random.default_rng(7)
     picture = rng.integers(0, 255, (MODEL.height, MODEL.width, 3)).astype(np.uint8)
+    if photograph is not None:
+        picture[:] = cv2.resize(photograph, (MODEL.width, MODEL.height), interpolation=cv2.INTER_AREA)
     with SessionWriter(path / "session.mcap") as out:
         out.write_tf_static(START, "lidar", "cam", T_LIDAR_CAM)
         out.write_tf_static(START, "lidar", "imu", np.eye(4))

@@ -311,9 +311,12 @@ def test_slots_are_shared_and_given_back() -> None:
     assert table.release(["car", "person"]) == [1]
     assert table.slot("car") is None
     assert not table.is_current(Prompt(1, "car"))
-    assert table.acquire(["tree"]) == [1]
-    assert table.names() == {1: "tree", 2: "person", 3: "bench"}
-    assert table.prompts()[0] == Prompt(1, "tree")
+    assert table.acquire(["tree"]) == [4]
+    assert table.names() == {2: "person", 3: "bench", 4: "tree"}
+    assert table.prompts()[-1] == Prompt(4, "tree")
+    assert (
+        table.acquire([f"thing {k}" for k in range(12)])[-1] == 1
+    )  # given back, used when there is no other
 
 
 def test_a_full_table_takes_nothing() -> None:

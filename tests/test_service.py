@@ -19,12 +19,14 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from artemis_edge import topics
+from artemis_edge.export.ply_reader import read_ply
+from artemis_edge.segmentation.registry import STORE_VARIABLE, Addition, Registry, file_hash
 from artemis_edge.service.control import default_path
 from artemis_edge.session.feed import messages
 from artemis_edge.session.replay import replay
 from artemis_edge.session.verify import verify
 from artemis_edge.session.wire_replay import WireRig, read
-from tests import small_session
+from tests import networks, small_session
 from tests.control_client import ask
 from tests.livox_ports import reserved
 from tests.waiting import until
@@ -74,27 +76,49 @@ class _Service:
 
 
 @pytest.fixture(scope="module")
-def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, _Service, dict[str, Any]]]:
+def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A network that calls what is red a car and what is green a person."""
+    tmp = tmp_path_factory.mktemp("model")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(STORE_VARIABLE, str(tmp / "store"))
+        path = networks.semantic(tmp / "colours.onnx")
+        classes = ("background", *networks.CLASSES)
+        Registry().add(Addition(path, {"model": file_hash(path)}, classes=classes, input_size=(64, 64)))
+        yield
+
+
+@pytest.fixture(scope="module")
+def played(
+    model: None, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Path, _Service, dict[str, Any]]]:
     """One run for all: a walk of two seconds, the mapping killed in the middle of it."""
     tmp = tmp_path_factory.mktemp("run")
-    walk = read(small_session.write(tmp / "walk", frames=25, points=3000))
+    red_and_green = networks.photograph()[:, :, ::-1]
+    walk = read(small_session.write(tmp / "walk", frames=25, points=3000, photograph=red_and_green))
     session, seen = tmp / "recorded", dict[str, Any]()
     with reserved(), WireRig(walk, tmp / "rig") as rig:
+        _keep_few_images(rig.folder / "rig.toml")
         service = _Service(rig, session, tmp)
         try:
             assert until(service.listens, _PATIENCE_S, 0.2), _log(service)
             assert until(lambda: _mapped(service) > 3, _PATIENCE_S, 0.2), _log(service)
             seen["status"] = ask(service.path, do="status")["result"]
             ask(service.path, do="mark", text="here")
+            seen["asked"] = [
+                ask(service.path, do="ask", text=text) for text in ("car", "green person", "giraffe", "")
+            ]
+            assert until(lambda: _found(service)["car"]["count"] > 0, _PATIENCE_S, 0.2), service.state()
             rig.begin(0.5)
             before = _mapped(service)
             assert until(lambda: _mapped(service) > before + 8, _PATIENCE_S, 0.2)
             seen["killed_at"] = _mapped(service)
             os.kill(service.state()["session"]["mapping"]["pid"], signal.SIGKILL)
             assert until(lambda: service.state()["session"]["mapping_restarts"] == 1, _PATIENCE_S, 0.2)
+            ask(service.path, do="forget", text="car")
             assert rig.over.wait(_PATIENCE_S)
             assert until(lambda: _mapped(service) >= seen["killed_at"], _PATIENCE_S, 0.2)
             seen["state"] = service.state()
+            seen["found"] = _found(service)
             seen["wire"] = dict(rig.avia.counters)
             service.process.send_signal(signal.SIGTERM)
             seen["code"] = service.process.wait(3 * _PATIENCE_S)
@@ -107,6 +131,17 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, _Se
 def _mapped(service: _Service) -> int:
     state = service.state()
     return int(((state["session"] or {}).get("mapping") or {}).get("frames", 0))
+
+
+def _keep_few_images(rig: Path) -> None:
+    """Colouring all kept points by all kept images is most of what saving takes."""
+    text = rig.read_text()
+    assert "images = 300" in text
+    rig.write_text(text.replace("images = 300", "images = 8"))
+
+
+def _found(service: _Service) -> dict[str, Any]:
+    return {query["text"]: query for query in ask(service.path, do="queries")["result"]["queries"]}
 
 
 def _log(service: _Service) -> str:
@@ -149,6 +184,22 @@ def test_replay_equals_live(played: tuple[Path, _Service, dict[str, Any]], tmp_p
     for name in ("mesh.ply", "trajectory.tum", "map/blocks.bin"):
         live, again = session / "result" / name, tmp_path / "replayed" / name
         assert live.read_bytes() == again.read_bytes(), name
+
+
+def test_questions_come_and_go_while_it_scans(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+    session, _, seen = played
+    car, person, giraffe, empty = seen["asked"]
+    assert (car["result"]["status"], person["result"]["status"]) == ("searching", "searching")
+    assert giraffe["result"]["status"] == "unsupported" and "giraffe" in giraffe["result"]["note"]
+    assert not empty["ok"] and "write what to look for" in empty["error"]
+    assert set(seen["found"]) == {"green person", "giraffe"}
+    assert seen["state"]["session"]["mapping"]["masks"] > 3
+    messages_of = [message.topic for message in messages(session)]
+    assert messages_of.count(topics.QUESTIONS.name) == 5  # at the start, three that are asked, one forgotten
+    assert messages_of.count(topics.MASKS.name) >= seen["state"]["session"]["mapping"]["masks"]
+    mesh = read_ply(session / "result" / "mesh.ply")
+    assert set(mesh.label_names.values()) == {"background", "person"}
+    assert (mesh.labels > 0).any() and mesh.label_names[int(mesh.labels.max())] == "person"
 
 
 def test_the_session_holds_what_it_should(played: tuple[Path, _Service, dict[str, Any]]) -> None:

@@ -224,7 +224,8 @@ def test_nearest_and_highlighted_vertices_win() -> None:
     assert tuple(image[10, 10]) == (255, 255, 255), "oneself"
     assert tuple(image[0, 0]) == SKY
     copy.apply(delta((0, 0, 0), np.array([[0, 3.0, 0]]), label=2))
-    image = draw(copy, 21, 21, (0, 0, 0), 0.0, "above", 21.0, {2: (255, 0, 0)})
+    car = QueryStatus("car", colour=(255, 0, 0), labels=[2])
+    image = draw(copy, 21, 21, (0, 0, 0), 0.0, "above", 21.0, [car])
     assert tuple(image[10, 13]) == SKY, "the block's newest state has replaced the older"
     assert image[7, 10, 0] > 200 > image[7, 10, 1]
 

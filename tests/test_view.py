@@ -14,10 +14,11 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.mesh import bare_mesh
 from artemis_edge.frames import MeshDelta
 from artemis_edge.service.map_feed import MapReader
+from artemis_edge.status import QueryStatus
 from artemis_edge.telling import telling
 from artemis_edge.view.gate import Gate, answer
 from artemis_edge.view.kinds import KINDS, coloured
-from artemis_edge.view.live import map_socket
+from artemis_edge.view.live import lighted, map_socket, sentence
 from artemis_edge.view.live_mesh import LiveMesh, Patch, patches, region_of
 from tests.textured import square_room
 
@@ -35,7 +36,7 @@ def delta_of(blocks: dict[tuple[int, int, int], Patch], index: int = 0) -> MeshD
         np.cumsum([0, *(len(part.vertex_id) for part in parts)]),
         np.cumsum([0, *(len(part.triangles) for part in parts)]),
         joined("vertex_id"), joined("position"), joined("position"), joined("colour"), joined("label"),
-        joined("confidence"), joined("triangles"),
+        joined("confidence"), joined("triangles"), joined("probability"),
     )  # fmt: skip
 
 
@@ -49,11 +50,12 @@ def patch(ids: list[int], triangles: list[list[int]], seed: int = 0) -> Patch:
         rng.integers(0, 5, n, dtype=np.uint8),
         rng.random(n, dtype=np.float32),
         np.array(triangles, np.int64).reshape(-1, 3),
+        rng.integers(0, 255, n, dtype=np.uint8),
     )
 
 
 def assert_same(a: Patch, b: Patch) -> None:
-    for name in ("vertex_id", "position", "colour", "label", "confidence", "triangles"):
+    for name in ("vertex_id", "position", "colour", "label", "confidence", "triangles", "probability"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
         assert getattr(a, name).dtype == getattr(b, name).dtype
 
@@ -195,3 +197,26 @@ def test_the_gate_passes_on_whoever_knows_the_token(tmp_path: Path) -> None:
                 assert page.read() == b"inside"
         finally:
             gate.close()
+
+
+def test_what_is_asked_for_lights_up() -> None:
+    mesh = bare_mesh(
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32),
+        np.array([[0, 1, 2]]),
+        labels=np.array([0, 3, 3], np.uint8),
+    )
+    asked = QueryStatus("car", "matched", 2, 0.9, (0, 200, 0), labels=[3])
+    colours = lighted(mesh, [asked]).colours
+    assert (colours[0] == mesh.colours[0]).all() and (colours[1, 1] > 150 > colours[1, 0]).all()
+    assert sentence(asked) == "car: 2 found, best 0.90"
+    assert sentence(QueryStatus("dog", "unsupported", note="no model")) == "dog: unsupported (no model)"
+
+
+def test_where_an_answer_changes_is_drawn_again() -> None:
+    live = LiveMesh()
+    live.apply(delta_of({(0, 0, 0): patch([5, 7], []), (9, 0, 0): patch([50], [])}))
+    live.take_dirty(10)
+    live.redraw([])
+    assert live.take_dirty(10) == []
+    live.redraw([int(live.blocks[9, 0, 0].label[0])])
+    assert (2, 0, 0) in live.take_dirty(10)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from artemis_edge.commands.common import DONE, command
 
 if TYPE_CHECKING:
+    from artemis_edge.status import QueryStatus
     from artemis_edge.view.live import LiveView
 
 _PORT = 8080
@@ -60,7 +61,23 @@ def _live_view(given: argparse.Namespace) -> LiveView:
 
     if given.live is not None:
         return LiveView(MapReader(map_socket(given.live)), given.host, given.port)
-    return LiveView(MapReader(map_socket(viewers_path(default_path()))), given.host, given.port, _ask_service)
+    feed = MapReader(map_socket(viewers_path(default_path())))
+    return LiveView(feed, given.host, given.port, _ask_service, _questions)
+
+
+def _questions() -> list[QueryStatus]:
+    """What the service is asked, and what lights up for it; none while it does not answer."""
+    from artemis_edge.service.control import default_path
+    from artemis_edge.tui.remote import RemoteError
+    from artemis_edge.tui.socket_remote import SocketRemote
+
+    remote = SocketRemote(default_path())
+    try:
+        return remote.status().queries
+    except RemoteError:
+        return []
+    finally:
+        remote.close()
 
 
 def _ask_service(text: str) -> Any:

@@ -102,25 +102,31 @@ def _all(phrase: Phrase) -> Iterator[Phrase]:
 
 
 class SlotTable:
-    """Which base class has which of the 15 slots of the map. A class has one slot however many questions need it."""
+    """Which base class has which of the 15 slots of the map. A class has one slot however many questions need it.
+
+    A slot that was given back is used again as late as possible: whoever looks at the map may still know its vertices
+    by its number.
+    """
 
     def __init__(self) -> None:
         self._slot: dict[str, int] = {}
+        self._free = list(range(1, MOST_SLOTS + 1))
         self._users: dict[str, int] = {}
 
     def acquire(self, classes: Iterable[str]) -> list[int]:
-        """Slots of the classes; new ones are taken from the free ones, lowest first.
+        """Slots of the classes; new ones are taken from the free ones: never used, then free for longest.
 
         Raises InputError, and takes none, where there are too few.
         """
         wanted = list(dict.fromkeys(classes))
         new = [name for name in wanted if name not in self._slot]
-        free = [slot for slot in range(1, MOST_SLOTS + 1) if slot not in self._slot.values()]
-        if len(new) > len(free):
+        if len(new) > len(self._free):
             raise InputError(
-                f"{len(new)} more classes are needed and {len(free)} of {MOST_SLOTS} slots are free; remove a question"
+                f"{len(new)} more classes are needed and {len(self._free)} of {MOST_SLOTS} slots are free; "
+                "remove a question"
             )
-        self._slot.update(zip(new, free, strict=False))
+        self._slot.update(zip(new, self._free, strict=False))
+        del self._free[: len(new)]
         for name in wanted:
             self._users[name] = self._users.get(name, 0) + 1
         return [self._slot[name] for name in wanted]
@@ -133,6 +139,7 @@ class SlotTable:
             if not self._users[name]:
                 del self._users[name]
                 freed.append(self._slot.pop(name))
+        self._free += freed
         return freed
 
     def slot(self, name: str) -> int | None:

@@ -27,17 +27,20 @@ from artemis_drivers.udp import Interface, interfaces
 
 from artemis_edge import health, topics
 from artemis_edge.errors import InputError, RunError
+from artemis_edge.segmentation.registry import Registry
 from artemis_edge.service.capture import Capture
 from artemis_edge.service.control import ControlSocket, control_path
 from artemis_edge.service.live_session import LiveSession, session_folder
 from artemis_edge.service.notify import Notifier
 from artemis_edge.service.outlet import Outlet
+from artemis_edge.service.questions import Desk
 from artemis_edge.service.rig import Rig, make_rig
 from artemis_edge.service.settings import RunConfig
 from artemis_edge.service.status_view import StatusView
 from artemis_edge.session.feed import recorded
 from artemis_edge.session.files import NAME
 from artemis_edge.session.message_ring import MessageRing
+from artemis_edge.status import QueryStatus
 
 _TURN_S = 0.05
 _STATE_AGE_S = 0.1
@@ -115,6 +118,9 @@ class Daemon:
         self.outlet = Outlet(MessageRing.create(config.service.ring_mb, _next_number(self.wanted.go_on)))
         self.capture = Capture(self.rig, self.outlet)
         self._view = StatusView(config)
+        self.desk = make_desk(config)
+        for text in self.wanted.queries:
+            self._asked_for(text)
         self.control = ControlSocket(
             control_path(config.service.socket), int(config.service.socket_mode, 8), self._answer
         )
@@ -231,14 +237,15 @@ class Daemon:
         about = {
             "version": metadata.version("artemis-edge"),
             "begun": datetime.now().astimezone().isoformat(timespec="seconds"),
-            "queries": list(self.wanted.queries),
+            "queries": [] if self.desk is None else list(self.desk.asked().texts),
             "devices": {h.name: dict(h.identity) for h in self.capture.health()},
             "applied": {
                 h.name: [f"{a.item}={a.read_back} ({a.status})" for a in h.applied]
                 for h in self.capture.health()
             },
         }
-        session = LiveSession(self.config, folder, self.outlet, self._tell, about, go_on)
+        asked = None if self.desk is None else self.desk.asked()
+        session = LiveSession(self.config, folder, self.outlet, self._tell, about, go_on, asked)
         session.begin()
         self.session = session
         self._become(Phase.RECORDING)
@@ -371,7 +378,7 @@ class Daemon:
                 "minutes_left": round(left / rate / 60, 1) if rate > 1000 else None,
             },
             "events": self._marks.events,
-            "queries": list(self.wanted.queries),
+            "queries": msgspec.to_builtins(self._questions()),
             "cpu_s": round(time.process_time(), 2),
         }
 
@@ -403,14 +410,48 @@ class Daemon:
             if self.phase != Phase.RECORDING:
                 raise InputError(f"a mark belongs to a recording: the service is {self.phase}")
             return {"number": self._mark(text)}
-        if what in ("ask", "forget"):
-            raise InputError("live questions are not answered yet; 'artemis-edge ask' asks the finished map")
+        if what == "ask":
+            return dict(msgspec.to_builtins(self._asked_for(request.get("text"))))
+        if what == "forget":
+            self._desk().forget(request.get("text"))
+            self._pass_on()
+            return {"queries": len(self._desk().asked().texts)}
+        if what == "queries":
+            return {"queries": msgspec.to_builtins(self._questions())}
         if what == "quit":
             self._quit = True
             return {"phase": str(self.phase)}
         raise InputError(
-            f"no request '{what[:40]}'; there are hello, status, state, start, stop, mark, subscribe, quit"
+            f"no request '{what[:40]}'; there are hello, status, state, start, stop, mark, ask, forget, queries, "
+            "subscribe, quit"
         )
+
+    # --- questions ---
+
+    def _desk(self) -> Desk:
+        if self.desk is None:
+            raise InputError(
+                "live questions need a camera, mapping = true and questions = true in [service]; "
+                "'artemis-edge ask' asks a finished map"
+            )
+        return self.desk
+
+    def _asked_for(self, text: object) -> QueryStatus:
+        status = self._desk().ask(text)
+        self._pass_on()
+        return status
+
+    def _pass_on(self) -> None:
+        """What is asked from now on, to the session that is recorded."""
+        self._known = None
+        if self.session is not None and self.session.ended_s is None:
+            self.session.ask(self._desk().asked())
+
+    def _questions(self) -> list[QueryStatus]:
+        if self.desk is None:
+            return []
+        segmentation = None if self.session is None else self.session.state()["segmentation"]
+        return self.desk.told(segmentation)
 
     def _asked_to_start(self, request: dict[str, Any]) -> dict[str, Any]:
         if self.phase != Phase.IDLE:
@@ -425,6 +466,13 @@ class Daemon:
             raise InputError(f"{folder} is there already; give another name")
         self._begin_checking(folder)
         return {"phase": str(self.phase)}
+
+
+def make_desk(config: RunConfig) -> Desk | None:
+    """Where questions are asked; None without cameras, mapping, or where they are switched off."""
+    if not (config.camera and config.service.mapping and config.service.questions):
+        return None
+    return Desk(Registry().find(config.mapping.segmentation.model).manifest)
 
 
 def _next_number(session: Path | None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import ctypes
 import os
 import time
@@ -11,14 +12,20 @@ from pathlib import Path
 from typing import Any
 
 from artemis_edge import config as mapping_config
+from artemis_edge import topics
 from artemis_edge.errors import InputError
 from artemis_edge.service import settings
 from artemis_edge.service.children import Child
 from artemis_edge.service.control import control_path, viewers_path
 from artemis_edge.service.mapper import MapperTask
-from artemis_edge.service.outlet import Outlet
+from artemis_edge.service.outlet import Outlet, rig_topics
+from artemis_edge.service.overload import Machine, OverloadControl
+from artemis_edge.service.questions import Restarts
+from artemis_edge.service.segmenter_task import SegmenterTask
 from artemis_edge.service.settings import RunConfig
+from artemis_edge.session.asked import Asked
 from artemis_edge.session.feed import recorded
+from artemis_edge.session.messages import Mask
 from artemis_edge.session.recorder import RecorderTask
 from artemis_edge.session.verify import CONFIG_NAME
 
@@ -26,6 +33,8 @@ RESULT = "result"
 _MB = 1_000_000
 _MOST_RESTARTS = 5
 _MAPPING_NICE = 5  # capture and recording go first
+_SEGMENTER_NICE = 15  # it has what the mapping leaves: late by design
+_JUDGE_S = 0.25
 _PR_SET_CHILD_SUBREAPER = 36
 
 #: Told of what happened: an event for the session, the log and the clients.
@@ -43,9 +52,11 @@ class LiveSession:
         tell: Tell,
         about: dict[str, Any],
         go_on: bool = False,
+        asked: Asked | None = None,
     ) -> None:
-        """``go_on``: its map continues the one that the folder has, if any."""
-        self.config, self.folder, self.outlet = config, folder, outlet
+        """``go_on``: its map continues the one that the folder has, if any. ``asked`` are the questions to begin with,
+        None where the map is to have no classes."""
+        self.config, self.folder, self.outlet, self.asked = config, folder, outlet, asked
         self.fault = ""
         self.begun_s = time.monotonic()
         self.ended_s: float | None = None
@@ -58,6 +69,13 @@ class LiveSession:
         self.mapper_last: dict[str, Any] = {}
         self.recorder: Child | None = None
         self.mapper: Child | None = None
+        self.segmenter: Child | None = None
+        self.segmenter_last: dict[str, Any] = {}
+        self._segmenter_restarts = Restarts()
+        service = config.service
+        self.control = OverloadControl(service.hot_c, service.low_battery_percent)
+        self.machine = Machine()
+        self._judged_s = 0.0
 
     def begin(self) -> None:
         """From now on everything is recorded; InputError if the folder cannot be made."""
@@ -69,15 +87,27 @@ class LiveSession:
             ) from None
         _adopt_orphans()
         self._out = result_folder(self.folder)
-        self._first = self.outlet.open(self.config, self._about)
+        self._first = self.outlet.open(
+            self.config, self._about, None if self.asked is None else self.asked.plain()
+        )
         self.recorder = self._start_recorder(self._first)
         if self.config.service.mapping:
             self.mapper = self._start_mapper()
+            if self.asked is not None:
+                self.segmenter = self._start_segmenter(self.asked)
+
+    def ask(self, asked: Asked) -> None:
+        """What is looked for from now on: for the recording and the mapping a message, for the network an order."""
+        self.asked = asked
+        self.outlet.say(topics.QUESTIONS.name, asked.plain())
+        if self.segmenter is not None:
+            self.segmenter.tell("asked", asked=asked.plain())
 
     def end(self) -> None:
         """No more messages: what there is will be written and mapped."""
         if self.ended_s is None:
             self.ended_s = time.monotonic()
+            self._end_segmenter()
             self._stop_at = self.outlet.close()
             for child in (self.recorder, self.mapper):
                 if child is not None:
@@ -95,6 +125,10 @@ class LiveSession:
             self.recorder.hear()
             if not self.recorder.alive:
                 self._recorder_ended(self.recorder)
+        if self.segmenter is not None:
+            self._hear_segmenter(self.segmenter)
+        if self.mapper is not None and self.ended_s is None and self.config.service.overload:
+            self._judge_load(self.mapper.latest)
         if self.mapper is not None:
             for line in self.mapper.hear():
                 self._mapper_says(line)
@@ -120,7 +154,11 @@ class LiveSession:
             "recorder_restarts": self.recorder_restarts,
             "mapping": self.mapper.latest if self.mapper is not None else self.mapper_last,
             "mapping_restarts": self.mapper_restarts,
+            "segmentation": self.segmenter.latest if self.segmenter is not None else self.segmenter_last,
             "fault": self.fault,
+            "reduced": self.control.load.reduced(),
+            "temperature_c": self.machine.temperature_c,
+            "battery_minutes": self.machine.minutes,
         }
 
     def _start_recorder(self, first: int) -> Child:
@@ -148,11 +186,70 @@ class LiveSession:
             str(viewers_path(control_path(self.config.service.socket))),
             int(self.config.service.socket_mode, 8),
             str(self.folder) if self._go_on else "",
+            self.asked is not None,
         )
         child = Child("artemis_edge.service.mapper", [self.outlet.ring.descriptor], task, _MAPPING_NICE)
         if self.ended_s is not None:
             child.tell("stop", at=self._stop_at)
         return child
+
+    def _judge_load(self, mapping: dict[str, Any]) -> None:
+        """Let the mapping do less while it is too much; the decision is a message of the session."""
+        now = time.monotonic()
+        if now - self._judged_s < _JUDGE_S or mapping.get("state") != "mapping":
+            return
+        self._judged_s = now
+        self.machine.look(now)
+        reached = mapping.get("load", 0) == self.control.load.level
+        readings = self.machine.readings(float(mapping.get("behind_s", 0.0)), reached)
+        load = self.control.look(now, readings)
+        if load is None:
+            return
+        self.outlet.say(topics.OVERLOAD.name, load.plain())
+        if self.segmenter is not None:
+            self.segmenter.tell("rate", hz=load.segmentation_hz)
+        what = ", ".join(load.reduced()) or "nothing"
+        self._tell({"kind": "overload", "level": load.level, "message": f"{load.why}; reduced: {what}"})
+
+    def _start_segmenter(self, asked: Asked) -> Child:
+        rule = self.config.mapping.segmentation
+        task = SegmenterTask(
+            rig_topics(self.config).cameras,
+            asked,
+            rule.least_score,
+            rule.overlap,
+            rule.most_hz,
+            str(viewers_path(control_path(self.config.service.socket))),
+        )
+        child = Child("artemis_edge.service.segmenter", [self.outlet.ring.descriptor], task, _SEGMENTER_NICE)
+        child.tell("rate", hz=self.control.load.segmentation_hz)
+        return child
+
+    def _hear_segmenter(self, child: Child) -> None:
+        """Its masks are sent like what a device measures; dead, another takes its place, and the map goes on."""
+        for line in child.hear():
+            if "mask" in line:
+                self._send_mask(line["mask"])
+        if child.alive:
+            return
+        why = str(child.latest.get("fault", "")) or f"its process ended ({child.process.returncode})"
+        self._end_segmenter()
+        failed = self.segmenter_last.get("state") == "failed"
+        if not failed and self.asked is not None and self._segmenter_restarts.allowed():
+            self.segmenter = self._start_segmenter(self.asked)
+        self._tell({"kind": "warning", "message": f"no masks from the network: {why}"})
+
+    def _send_mask(self, text: str) -> None:
+        mask = Mask.decode(base64.b64decode(text))
+        self.outlet.send(topics.MASKS.name, mask, mask.header.stamp_ns)
+
+    def _end_segmenter(self) -> None:
+        if self.segmenter is None:
+            return
+        child, self.segmenter = self.segmenter, None
+        self.segmenter_last = child.latest
+        child.process.kill()
+        child.end(0.0)
 
     def _recorder_ended(self, child: Child) -> None:
         """Ended in order, or died: then another one goes on where the last one's file ends."""

@@ -12,6 +12,7 @@ import json
 import os
 import socket
 import struct
+import time
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ MOST_VIEWERS = 8
 _BLOCKS = 24  # in one message: some hundred kB
 _FIELDS = (
     "block", "vertex_start", "triangle_start", "vertex_id", "position", "normal", "colour", "label",
-    "confidence", "triangles",
+    "confidence", "triangles", "probability",
 )  # fmt: skip
 
 
@@ -62,6 +63,7 @@ class _Viewer:
         self.socket = connection
         self.newest = Newest()
         self.unsent = memoryview(b"")
+        self.began_s = 0.0  # with the message that was sent last
 
 
 class MapFeed:
@@ -83,6 +85,7 @@ class MapFeed:
         self._listener.listen()
         self._listener.setblocking(False)
         self._viewers: list[_Viewer] = []
+        self.most_hz = 0.0  # messages a second to each viewer; 0: without bound
 
     def __len__(self) -> int:
         return len(self._viewers)
@@ -138,9 +141,12 @@ class MapFeed:
                 new = True
         return new
 
-    @staticmethod
-    def _send(viewer: _Viewer) -> None:
+    def _send(self, viewer: _Viewer) -> None:
         if not viewer.unsent:
+            now = time.monotonic()
+            if self.most_hz > 0.0 and now - viewer.began_s < 1.0 / self.most_hz:
+                return
+            viewer.began_s = now
             delta = viewer.newest.take(_BLOCKS)
             if delta is None:
                 return

@@ -30,6 +30,7 @@ from artemis_edge.loop.relocate import Found
 from artemis_edge.service.checkpoint import Checkpoints
 from artemis_edge.service.map_feed import MapFeed
 from artemis_edge.session.feed import LiveFeed
+from artemis_edge.session.late_masks import LateMasks
 from artemis_edge.session.line_channel import LineChannel
 from artemis_edge.session.message_ring import MessageRing, Sent
 from artemis_edge.session.results import prepare, scratch
@@ -48,7 +49,7 @@ class MapperTask(Struct, frozen=True):
     """What the service tells the mapping: ``config`` as TOML, the session's folder, where the map goes.
 
     ``viewers`` is the path of the socket for viewers of the growing mesh (empty: none), with its file mode.
-    ``earlier`` is where a map may be that this one is to continue (empty: none).
+    ``earlier`` is where a map may be that this one is to continue (empty: none). With ``questions`` the map has classes.
     """
 
     folder: str
@@ -59,6 +60,7 @@ class MapperTask(Struct, frozen=True):
     viewers: str = ""
     viewers_mode: int = 0o600
     earlier: str = ""
+    questions: bool = False
 
 
 class LiveMapper:
@@ -68,7 +70,7 @@ class LiveMapper:
         self.task, self.channel = task, channel
         self.feed = LiveFeed(ring, Path(task.folder), task.first)
         config = from_toml(task.config) if task.config else Config()
-        self.mapping = StreamMapping(config, pages)
+        self.mapping = StreamMapping(config, pages, questions=task.questions)
         self.checkpoints = Checkpoints(self._reopen)
         self.mapping.before = self.checkpoints.working_on
         self._config, self._pages = config, pages
@@ -136,6 +138,7 @@ class LiveMapper:
         if self.mapping.assembler.next_index % _COLLECT_EVERY == 0:
             gc.collect()
         if self.viewers is not None and self.mapping.delta is not None:
+            self.viewers.most_hz = self.mapping.load.preview_hz
             self.viewers.add(self.mapping.delta)
         if time.monotonic() - self._checked > self.task.checkpoint_s:
             _call(self.mapping.mapper, "before_copy")
@@ -180,6 +183,7 @@ class LiveMapper:
         statistics, feed = self.mapping.statistics, self.feed
         tracked = self.mapping.mapper.tracked
         times = statistics.frame_ms[-_LATEST:]
+        masks = self.mapping.masks or LateMasks()
         pose = self.mapping.mapper.trajectory[-1][1] if self.mapping.mapper.trajectory else np.eye(4)
         return {
             "frames": self.mapping.assembler.next_index,
@@ -193,7 +197,10 @@ class LiveMapper:
             "from_files": feed.from_files,
             "missed": feed.missed,
             "pose": [round(float(v), 4) for v in pose[:3].ravel()],
-            "lost": {**statistics.lost, **self.mapping.assembler.lost},
+            "lost": {**statistics.lost, **self.mapping.assembler.lost, **masks.lost},
+            "masks": masks.fused,
+            "behind_s": round(feed.behind_s(), 2),
+            "load": self.mapping.load.level,
             "fault": self.mapping.fault,
             "degenerate": bool(tracked is not None and tracked.degenerate),
             "coaching": self._coaching(),
@@ -234,7 +241,8 @@ def _work(task: MapperTask, ring: MessageRing, channel: LineChannel) -> None:
     prepare(out)
     with scratch(out) as pages:
         channel.say({"state": "warming up", "pid": os.getpid()})
-        warm_up(from_toml(task.config) if task.config else Config(), pages / "warm-up")
+        config = from_toml(task.config) if task.config else Config()
+        warm_up(config, pages / "warm-up", questions=task.questions)
         gc.collect()
         gc.freeze()
         gc.disable()

@@ -34,7 +34,7 @@ class Outlet:
         self.too_large = 0
         self.sent: Counter[str] = Counter()
         self._last_ns = 0
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def send(self, topic: str, message: Message, stamp_ns: int, rx_ns: int | None = None) -> None:
         """A message measured at session time ``stamp_ns`` and received at host time ``rx_ns`` (None: now)."""
@@ -68,8 +68,15 @@ class Outlet:
                 last,
             )
 
-    def open(self, config: RunConfig, about: dict[str, Any]) -> int:
-        """Begin a session with what readers need first; returns the number of its first message."""
+    def open(self, config: RunConfig, about: dict[str, Any], asked: dict[str, Any] | None = None) -> int:
+        """Begin a session with what readers need first; returns the number of its first message.
+
+        ``asked`` are the questions to begin with, None where none can be asked.
+        """
+        with self._lock:  # before anything that is measured
+            return self._open(config, about, asked)
+
+    def _open(self, config: RunConfig, about: dict[str, Any], asked: dict[str, Any] | None) -> int:
         first = self.ring.published
         self.is_open = True
         self.sent.clear()
@@ -78,6 +85,8 @@ class Outlet:
             topics.RIG.name, {"topics": _plain(topic_names), "wall_minus_monotonic_ns": self.wall_ns, **about}
         )
         now = time.monotonic_ns() + self.wall_ns
+        if asked is not None:
+            self.say(topics.QUESTIONS.name, asked)
         for child, T in mounts(config):
             self.send(topics.TF_STATIC.name, TFMessage((_static(now, child, T),)), now)
         for entry, name in zip(config.camera, camera_prefixes(config), strict=True):

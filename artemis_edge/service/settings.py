@@ -104,6 +104,20 @@ class ServiceSettings(Struct, frozen=True, forbid_unknown_fields=True):
         20.0
     )
     mapping: Annotated[bool, Meta(description="Map while recording.")] = True
+    overload: Annotated[
+        bool,
+        Meta(description="Map less, in a fixed order, when the mapping is behind or the machine too warm."),
+    ] = True
+    hot_c: Annotated[float, Meta(description="Too warm: from here on less is mapped.", ge=40.0, le=120.0)] = (
+        80.0
+    )
+    low_battery_percent: Annotated[
+        float, Meta(description="Battery from which on less is mapped.", ge=0.0, le=100.0)
+    ] = 15.0
+    questions: Annotated[
+        bool,
+        Meta(description="Take questions while recording: the map has classes, a network looks for them."),
+    ] = True
 
 
 class RunConfig(Struct, frozen=True, forbid_unknown_fields=True):

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
 from artemis_drivers.base import Health, State
 
 from artemis_edge.service.settings import RunConfig, device_name
@@ -18,7 +19,6 @@ _LOST = ("points_lost", "lost", "missing", "triggers_lost")
 _PACKETS_HZ = {"first": 2500.0, "strongest": 2500.0, "dual": 5000.0, "triple": 8000.0}
 _LEAST_SPAN_S = 0.9
 _NS = 1e9
-_LATER = "live questions are not answered yet; ask the finished map"
 _BEHIND_MESSAGES = 4000  # a few seconds of them
 
 
@@ -57,14 +57,14 @@ class StatusView:
             sync=_sync(state),
             frame_ms=mapping.get("frame_ms_list", []),
             disk_minutes=state["disk"]["minutes_left"],
-            overload=_overload(mapping, recorder),
+            overload=[*session.get("reduced", []), *_overload(mapping, recorder)],
+            temperature_c=session.get("temperature_c"),
+            battery_minutes=session.get("battery_minutes"),
             degenerate=bool(mapping.get("degenerate", False)),
             coaching=list(mapping.get("coaching", [])),
             losses={**state["lost"], **mapping.get("lost", {})},
-            queries=[
-                QueryStatus(text, "unsupported", note="asked when the map is finished")
-                for text in state["queries"]
-            ],
+            queries=msgspec.convert(state["queries"], list[QueryStatus]),
+            segmentation_hz=float((session.get("segmentation") or {}).get("hz", 0.0)),
             position=(pose[3], pose[7], pose[11]),
             yaw=math.atan2(pose[4], pose[0]),
         )

@@ -14,6 +14,7 @@ from artemis_edge.session.mcap_file import GrowingFile
 from artemis_edge.session.message_ring import MessageRing, OverwrittenError, Sent
 
 _WHOLE = -1
+_NS = 1e9
 
 
 def messages(path: Path) -> Iterator[Sent]:
@@ -54,6 +55,7 @@ class LiveFeed:
         self.ring, self.folder = ring, folder
         self.next = first
         self.from_files = self.missed = 0
+        self.log_ns = 0  # of the message that was taken last
         self._filed: Iterator[Sent] | None = None
 
     def take(self) -> Sent | None:
@@ -67,7 +69,15 @@ class LiveFeed:
         if sent is not None:
             self.missed += sent.number - self.next
             self.next = sent.number + 1
+            self.log_ns = sent.log_ns
         return sent
+
+    def behind_s(self) -> float:
+        """Between the newest message and the one that was taken last; 0 before there is any."""
+        latest = self.ring.latest_log_ns()
+        if latest is None or not self.log_ns or self.next >= self.ring.published:
+            return 0.0
+        return (latest - self.log_ns) / _NS
 
     def _recorded(self, oldest: int) -> Sent | None:
         """From the files; what they do not have either is passed over."""

@@ -121,6 +121,15 @@ class MessageRing:
         topic, ros_type = self._name(name)
         return Sent(number, topic, ros_type, log_ns, stamp_ns, data)
 
+    def latest_log_ns(self) -> int | None:
+        """Log time of the newest message; None while there is none."""
+        number = self.published - 1
+        if number < self.oldest:
+            return None
+        row = int(self._place[number % PLACES]) % self._room
+        found, log_ns, *_ = _HEAD.unpack_from(self._bytes, row)
+        return int(log_ns) if found == number else None
+
     def close(self) -> None:
         """Give the memory back; it lives on while another process has it."""
         self._count = self._place = np.empty(0, np.int64)

@@ -343,6 +343,47 @@ class RawPackets(Message):
 
 
 @dataclass(frozen=True, slots=True)
+class Mask(Message):
+    """artemis_msgs/msg/Mask: what a network saw in the image that the header names, for each slot it was asked for.
+
+    ``slot`` uint8 (l,) and ``text`` are the layers, 0 the background; ``score`` is deflated (zlib) uint8 (height,
+    width, l), 255 is probability 1; ``grid`` float64 (4,): a cell is scale x, y times the pixel plus offset x, y.
+    """
+
+    ROS_TYPE: ClassVar[str] = "artemis_msgs/msg/Mask"
+    header: Header
+    slot: NDArray[Any]
+    text: tuple[str, ...]
+    height: int
+    width: int
+    grid: F64
+    score: Buffer
+
+    def encode(self) -> bytes:
+        """The CDR bytes."""
+        cdr = CdrWriter()
+        self.header.write(cdr)
+        cdr.sequence("B", self.slot)
+        cdr.write("I", len(self.text))
+        for text in self.text:
+            cdr.string(text)
+        cdr.write("I", self.height)
+        cdr.write("I", self.width)
+        cdr.array("d", self.grid)
+        cdr.write("I", len(self.score))
+        cdr.octets(self.score)
+        return cdr.finish()
+
+    @classmethod
+    def read(cls, cdr: CdrReader) -> Self:
+        """From the position of a reader."""
+        header, slot = Header.read(cdr), cdr.sequence("B")
+        text = tuple(cdr.string() for _ in range(cdr.count(smallest_item=5)))
+        height, width, grid = cdr.read("I"), cdr.read("I"), cdr.array("d", 4)
+        return cls(header, slot, text, height, width, grid, cdr.octets(cdr.read("I")))
+
+
+@dataclass(frozen=True, slots=True)
 class CameraInfo(Message):
     """sensor_msgs/msg/CameraInfo: ``k`` (9,), ``r`` (9,), ``p`` (12,) row-major, ``d`` of the model."""
 

@@ -15,7 +15,7 @@ from artemis_edge.progress import Report, silent
 from artemis_edge.runtime import MakeMapper, pipeline
 from artemis_edge.session import feed
 from artemis_edge.session.results import prepare, scratch
-from artemis_edge.session.stream_mapping import StreamMapping, warm_up
+from artemis_edge.session.stream_mapping import StreamMapping, has_questions, warm_up
 from artemis_edge.session.verify import session_config
 
 _SECOND_NS = 1_000_000_000
@@ -59,12 +59,12 @@ def replay(
     RunError if a result cannot be written.
     """
     config = session_config(session) if config is None else config
-    stream = feed.messages(session)
+    questions, stream = has_questions(feed.messages(session))
     prepare(out)
     wait = (pace or Pace()).waiter()
     with scratch(out) as pages, Interrupt() as interrupt:
-        warm_up(config, pages / "warm-up", make)
-        mapping = StreamMapping(config, pages, make, session.name)
+        warm_up(config, pages / "warm-up", make, questions)
+        mapping = StreamMapping(config, pages, make, session.name, questions)
         for sent in stream:
             wait(sent.log_ns)
             if mapping.take(sent):

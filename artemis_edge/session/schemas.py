@@ -53,6 +53,10 @@ _DEFINITIONS = {
         "std_msgs/Header header\nint64[] receive_ns\nuint32[] id\nuint32[] size\nuint8[] data\n"
     ),
     "artemis_msgs/CameraExposure": "std_msgs/Header header\nfloat64 exposure_s\nfloat64 gain\n",
+    "artemis_msgs/Mask": (
+        "std_msgs/Header header\nuint8[] slot\nstring[] text\nuint32 height\nuint32 width\nfloat64[4] grid\n"
+        "uint8[] score\n"
+    ),
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
     "nav_msgs/Odometry": (
         "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"

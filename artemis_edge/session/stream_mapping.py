@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gc
+import json
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +19,27 @@ from artemis_edge.config import Config, to_toml
 from artemis_edge.continuing import EarlierMap
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.exclusion import Zones
+from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import MeshDelta, SyncedFrame, Trajectory
+from artemis_edge.highlight import Reply, answer, objects_of
 from artemis_edge.keeper import Keeper
 from artemis_edge.loop.relocate import Found
 from artemis_edge.mapping_run import Mapper
 from artemis_edge.runtime import MakeMapper, pipeline, with_tiny_map, write_results
+from artemis_edge.segmentation import attribute
+from artemis_edge.segmentation.backend import DenseScores, Grid
+from artemis_edge.session.asked import Asked
 from artemis_edge.session.assembly import FrameAssembler
+from artemis_edge.session.late_masks import LateMasks, pack
 from artemis_edge.session.late_odometry import LOOKED_AT, LateOdometry
+from artemis_edge.session.load import Load
 from artemis_edge.session.message_ring import Sent
 from artemis_edge.session.messages import (
     CameraInfo,
     CompressedImage,
     Header,
     Imu,
+    Mask,
     Message,
     Text,
     TFMessage,
@@ -43,23 +54,35 @@ _NS_PER_MS = 1e6
 _WARM_UP_FRAMES = 4
 _FRAME_NS = 100_000_000
 _INPUT_HZ = 10.0
+_ABOUT_QUESTIONS = frozenset({topics.QUESTIONS.name, topics.MASKS.name})
 
 
 class StreamMapping:
     """Takes messages in their order; every frame that one completes is mapped.
 
-    ``skip`` are indices of frames that are not mapped, because mapping them ended the process.
+    ``skip`` are indices of frames that are not mapped, because mapping them ended the process. With ``questions`` the
+    map has classes, asked for and seen by messages of the stream.
     """
 
-    def __init__(self, config: Config, pages: Path, make: MakeMapper = pipeline, name: str = "live") -> None:
+    def __init__(
+        self,
+        config: Config,
+        pages: Path,
+        make: MakeMapper = pipeline,
+        name: str = "live",
+        questions: bool = False,
+    ) -> None:
         self.config = config
         self.assembler = FrameAssembler()
         self._zones = Zones.of(config.exclusion)
         self.odometry = LateOdometry(config.odometry)
-        self.mapper: Mapper = make(config, self.odometry, pages)
+        self.masks = LateMasks() if questions else None
+        segmenter = () if self.masks is None else (self.masks,)
+        self.mapper: Mapper = make(config, self.odometry, pages, *segmenter)
         self.keeper = Keeper(pages, config.keep, config.segmentation)
         self._prepare = self.keeper.between(lambda frame: frame, self.mapper)
         self.statistics = RunStatistics(name, _INPUT_HZ, config_toml=to_toml(config))
+        self.load = Load()
         self.skip: set[int] = set()
         self._first: list[SyncedFrame] | None = []  # until the odometry is chosen
         self.latest_ns = 0
@@ -75,6 +98,12 @@ class StreamMapping:
 
     def take(self, sent: Sent) -> bool:
         """Whether the message completed a frame. A frame that cannot be mapped is counted and skipped."""
+        if self.masks is not None and sent.topic in _ABOUT_QUESTIONS:
+            self._take_question(self.masks, sent)
+            return False
+        if sent.topic == topics.OVERLOAD.name:
+            self._take_load(sent)
+            return False
         frame = self.assembler.take(sent)
         if frame is None:
             return False
@@ -82,6 +111,26 @@ class StreamMapping:
         for ready in self._ready(self._zones.applied(frame)):
             self._one(ready)
         return True
+
+    def _take_question(self, masks: LateMasks, sent: Sent) -> None:
+        """What is asked from now on, or a mask. One that is damaged is counted."""
+        try:
+            if sent.topic == topics.MASKS.name:
+                masks.take(Mask.decode(sent.data))
+                return
+            masks.asked = Asked.decode(Text.decode(sent.data).text)
+            self.mapper.ask(masks.asked.slots)
+        except ValueError:
+            masks.lost["questions_undecodable"] += 1
+
+    def _take_load(self, sent: Sent) -> None:
+        """How much may be done from the next frame on."""
+        try:
+            self.load = Load.decode(Text.decode(sent.data).text)
+        except ValueError:
+            self.statistics.add_lost({"loads_undecodable": 1})
+            return
+        self.mapper.reduce(self.load)
 
     def save(self, out: Path) -> dict[str, Any]:
         """Finish the map and write all results to ``out``; returns what report.json holds. Raises RunError."""
@@ -102,8 +151,12 @@ class StreamMapping:
         self.statistics.add_lost({f"odometry_{reason.replace(' ', '_')}": n for reason, n in found})
         results = Results(out)
         photos = HeldOut(out, 0)
+        answering = None
+        if self.masks is not None:
+            self.statistics.add_lost(self.masks.lost)
+            answering = None if self.masks.asked is None else StreamAnswers(self.masks.asked)
         report = write_results(
-            results, self.trajectory(), self.mapper, self.keeper, photos, self.statistics, None
+            results, self.trajectory(), self.mapper, self.keeper, photos, self.statistics, None, answering
         )
         return {"report": report or {}, "kept": results.kept, "fault": results.fault or ""}
 
@@ -138,7 +191,7 @@ class StreamMapping:
             self._drop("frames_skipped")
 
     def _map(self, frame: SyncedFrame) -> None:
-        frame = self._prepare(frame)
+        frame = self._prepare(thinned(frame, self.load.every_point))
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
         self.delta = self.mapper.process(frame)
         wall, cpu = time.perf_counter_ns() - wall, time.process_time_ns() - cpu
@@ -150,12 +203,51 @@ class StreamMapping:
         self.statistics.add_lost({reason: 1})
 
 
-def warm_up(config: Config, folder: Path, make: MakeMapper = pipeline) -> float:
+def thinned(frame: SyncedFrame, every: int) -> SyncedFrame:
+    """The frame with every so-manyth point of its scans."""
+    if every == 1:
+        return frame
+    scans = tuple(
+        replace(
+            scan,
+            points=np.ascontiguousarray(scan.points[::every]),
+            offset_s=None if scan.offset_s is None else np.ascontiguousarray(scan.offset_s[::every]),
+            intensity=None if scan.intensity is None else np.ascontiguousarray(scan.intensity[::every]),
+        )
+        for scan in frame.scans
+    )
+    return replace(frame, scans=scans)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamAnswers:
+    """What the finished map answers to the questions that were asked last."""
+
+    asked: Asked
+
+    def replies(self, mesh: Mesh, mapper: Mapper) -> list[Reply]:
+        """One for each question."""
+        return answer(self.asked.understood(), objects_of(mesh, mapper.probability))
+
+
+def has_questions(stream: Iterator[Sent]) -> tuple[bool, Iterator[Sent]]:
+    """Whether a stream tells of questions before its first cloud, as all of a run with questions do; and the stream."""
+    first: list[Sent] = []
+    found = False
+    for sent in stream:
+        first.append(sent)
+        found = found or sent.topic == topics.QUESTIONS.name
+        if found or sent.topic == topics.LIDAR_POINTS.name:
+            break
+    return found, chain(first, stream)
+
+
+def warm_up(config: Config, folder: Path, make: MakeMapper = pipeline, questions: bool = False) -> float:
     """Have every kernel compiled or loaded before the first frame, on a small made-up room; returns the seconds."""
     start = time.perf_counter()
     folder.mkdir(parents=True, exist_ok=True)
-    mapping = StreamMapping(with_tiny_map(config), folder, make)
-    for number, (topic, message) in enumerate(_room()):
+    mapping = StreamMapping(with_tiny_map(config), folder, make, questions=questions)
+    for number, (topic, message) in enumerate(_room(questions)):
         mapping.take(Sent(number, topic, message.ROS_TYPE, 0, 0, message.encode()))
     mapping.mapper.finish()
     del mapping
@@ -164,9 +256,12 @@ def warm_up(config: Config, folder: Path, make: MakeMapper = pipeline) -> float:
     return time.perf_counter() - start
 
 
-def _room() -> Iterator[tuple[str, Message]]:
+def _room(questions: bool) -> Iterator[tuple[str, Message]]:
     """Messages of a few frames in a room, of every kind that a frame can hold."""
     rng = np.random.default_rng(0)
+    asked = Asked(attribute.manifest(), (), {1: "anything"})
+    if questions:
+        yield topics.QUESTIONS.name, Text(json.dumps(asked.plain()))
     yield topics.RIG.name, Text('{"topics": {}}')
     forward = np.array([-0.5, 0.5, -0.5, 0.5])  # quaternion of an optical frame that looks along x
     mount = TransformStamped(Header(0, "lidar"), "cam", np.zeros(3), forward)
@@ -186,6 +281,9 @@ def _room() -> Iterator[tuple[str, Message]]:
             topics.CAMERA_IMAGE.name,
             CompressedImage(Header(stamp + _FRAME_NS // 2, "cam"), "jpeg", picture),
         )
+        if questions:
+            scores = DenseScores((0, 1), np.full((4, 4, 2), 127, np.uint8), Grid(0.05, 0.05, 0.0, 0.0))
+            yield topics.MASKS.name, pack("cam", stamp + _FRAME_NS // 2, asked.prompts, scores)
         n = 6000
         points = rng.uniform([-6, -4, -1.5], [6, 4, 2.5], (n, 3)).astype(np.float32)
         wall = rng.integers(0, 3, n)
@@ -195,3 +293,5 @@ def _room() -> Iterator[tuple[str, Message]]:
             topics.LIDAR_POINTS.name,
             cloud_message(stamp, points, np.full(n, 0.5, np.float32), offset_ns=offset),
         )
+    if questions:
+        yield topics.QUESTIONS.name, Text(json.dumps(Asked(asked.model).plain()))

@@ -120,14 +120,13 @@ class LivePage(Screen[None]):
         if not self.is_current or picture.size.width == 0:
             return
         width, height = picture.pixels
-        at = self._look_at or self._status.position
+        status = self._status
+        at = self._look_at or status.position
         # without colour what is asked for is bright, all else steps back
-        colours = {
-            label: q.colour if self._colour else _WHITE for q in self._status.queries for label in q.labels
-        }
-        picture.message = "" if len(self._copy) else self._status.message or "no map yet"
+        queries = status.queries if self._colour else [replace(q, colour=_WHITE) for q in status.queries]
+        picture.message = "" if len(self._copy) else status.message or "no map yet"
         picture.caption = f"{'from above' if self.view == 'above' else 'from behind'}, {self.span_m:.0f} m"
-        picture.show(draw(self._copy, width, height, at, self._status.yaw, self.view, self.span_m, colours))
+        picture.show(draw(self._copy, width, height, at, status.yaw, self.view, self.span_m, queries))
 
     def action_view(self) -> None:
         """Behind, above, behind ..."""

@@ -5,6 +5,7 @@ In a terminal a pixel is a decimetre or more, and vertices lie that close; trian
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from artemis_edge.frames import F32, F64, I64, U8, MeshDelta
+from artemis_edge.lights import lit
 from artemis_edge.status import QueryStatus
 
 Kind = Literal["behind", "above"]
@@ -133,9 +135,9 @@ def draw(
     yaw: float,
     kind: Kind = "behind",
     span_m: float = 40.0,
-    colours: dict[int, tuple[int, int, int]] | None = None,
+    queries: Sequence[QueryStatus] = (),
 ) -> U8:
-    """Picture uint8 (height, width, 3). ``colours`` are those of highlighted labels; ``span_m`` is shown across.
+    """Picture uint8 (height, width, 3). What ``queries`` mean lights up; ``span_m`` is shown across.
 
     Pixels are square. From above north (y) is up; the operator is drawn as a bright cross.
     """
@@ -144,7 +146,7 @@ def draw(
     view = _above if kind == "above" else _behind
     u, v, depth = view(points, width, height, np.array(position), yaw, span_m)
     seen = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (depth > 0.3)
-    shade = highlight(shade, label, colours or {})
+    shade = highlight(shade, points, label, queries)
     rows = np.flatnonzero(seen)
     order = rows[np.argsort(-depth[rows], kind="stable")]  # the nearest is drawn last
     flat = v[order].astype(np.int64) * width + u[order].astype(np.int64)
@@ -154,13 +156,12 @@ def draw(
     return image
 
 
-def highlight(shade: U8, label: U8, colours: dict[int, tuple[int, int, int]]) -> U8:
-    """Labels in ``colours`` glow in theirs, all else steps back; unchanged where nothing is asked."""
-    if not colours:
+def highlight(shade: U8, points: F32, label: U8, queries: Sequence[QueryStatus]) -> U8:
+    """What is asked for glows in its colour, all else steps back; unchanged where nothing is looked for."""
+    if not any(query.labels for query in queries):
         return shade
     out = (shade * _DIM).astype(np.uint8)
-    for number, colour in colours.items():
-        rows = label == number
+    for rows, colour in lit(points, label, queries):
         mixed = 0.25 * shade[rows] + 0.75 * np.array(colour, np.float32)
         out[rows] = mixed.astype(np.uint8)
     return out

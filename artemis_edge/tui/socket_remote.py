@@ -45,8 +45,8 @@ class SocketRemote:
 
     def ask(self, text: str) -> str:
         """Add a live question."""
-        self._ask({"do": "ask", "text": text})
-        return f"looking for '{text}'"
+        found = self._ask({"do": "ask", "text": text})
+        return str(found["note"]) if found.get("status") == "unsupported" else f"looking for '{text}'"
 
     def forget(self, text: str) -> str:
         """Remove a live question."""

@@ -221,6 +221,8 @@ def gauges(status: Status) -> RenderResult:
         text.append(f"{status.map.resident_mb:.0f} MB  ")
     if status.segmentation_hz:
         text.append(f"masks {status.segmentation_hz:.1f} Hz  ")
+    if status.temperature_c is not None:
+        text.append(f"{status.temperature_c:.0f} C  ")
     if status.overload:
         text.append("reduced: " + ", ".join(status.overload), style="yellow")
     return text

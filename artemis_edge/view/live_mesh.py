@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ class Patch:
     label: U8
     confidence: F32
     triangles: I64
+    probability: U8
 
 
 def patches(delta: MeshDelta) -> Iterator[tuple[BlockKey, Patch]]:
@@ -42,6 +43,7 @@ def patches(delta: MeshDelta) -> Iterator[tuple[BlockKey, Patch]]:
                 delta.label[v],
                 delta.confidence[v],
                 delta.triangles[t],
+                delta.probability[v],
             ),
         )
 
@@ -60,9 +62,15 @@ class LiveMesh:
             self.blocks[key] = patch
             self._regions.setdefault(region_of(key), set()).add(key)
             # a triangle of the neighbouring block may use a vertex of this one
-            for near in _around(key):
+            for near in around(key):
                 if near in self.blocks:
                     self._dirty.setdefault(region_of(near))
+
+    def redraw(self, labels: Sequence[int]) -> None:
+        """Have the regions drawn again that hold vertices of these labels."""
+        for key, patch in self.blocks.items() if labels else ():
+            if np.isin(patch.label, labels).any():
+                self._dirty.setdefault(region_of(key))
 
     def take_dirty(self, most: int) -> list[BlockKey]:
         """At most so many regions that changed since they were taken."""
@@ -74,13 +82,13 @@ class LiveMesh:
     def region_mesh(self, region: BlockKey) -> Mesh:
         """The triangles of a region's blocks; those whose vertex is not known yet are left out."""
         own = sorted(self._regions.get(region, ()))
-        used = sorted({near for key in own for near in _around(key) if near in self.blocks})
+        used = sorted({near for key in own for near in around(key) if near in self.blocks})
         if not used:
             return bare_mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
         parts = [self.blocks[key] for key in used]
         ids = np.concatenate([part.vertex_id for part in parts])
         triangles = np.concatenate([self.blocks[key].triangles for key in own])
-        faces = _rows(ids, triangles)
+        faces = rows_of(ids, triangles)
         kept = np.unique(faces)
         renumber = np.zeros(len(ids), np.int32)
         renumber[kept] = np.arange(len(kept), dtype=np.int32)
@@ -98,13 +106,14 @@ def region_of(block: BlockKey) -> BlockKey:
     return block[0] // REGION_BLOCKS, block[1] // REGION_BLOCKS, block[2] // REGION_BLOCKS
 
 
-def _around(key: BlockKey) -> list[BlockKey]:
+def around(key: BlockKey) -> list[BlockKey]:
+    """A block and its neighbours."""
     x, y, z = key
     return [(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
 
 
-def _rows(ids: I64, triangles: I64) -> I32:
-    """Rows of ``ids`` for the vertices of triangles (t, 3), without those that name another."""
+def rows_of(ids: I64, triangles: I64) -> I32:
+    """Rows of ``ids`` (n,) for the vertices of triangles (t, 3), without those that name another."""
     if len(ids) == 0 or len(triangles) == 0:
         return np.empty((0, 3), np.int32)
     order = np.argsort(ids, kind="stable")
