@@ -49,7 +49,8 @@ class MapperTask(Struct, frozen=True):
     """What the service tells the mapping: ``config`` as TOML, the session's folder, where the map goes.
 
     ``viewers`` is the path of the socket for viewers of the growing mesh (empty: none), with its file mode.
-    ``earlier`` is where a map may be that this one is to continue (empty: none). With ``questions`` the map has classes.
+    ``earlier`` is where a map may be that this one is to continue (empty: none).
+    With ``questions`` the map has classes.
     """
 
     folder: str
