@@ -90,6 +90,8 @@ install-service: $(READY)
 	@install -D -m 644 -t $(ROOT)/etc/udev/rules.d firmware_cfg/udev/99-artemis.rules
 	@test -e $(ROOT)/etc/artemis/rig.toml || { mkdir -p $(ROOT)/etc/artemis && \
 	  { cat firmware_cfg/profiles/field.toml; printf '\n[service]\nrecord_at_start = false\n'; } >$(ROOT)/etc/artemis/rig.toml; }
+	@test -n "$(ROOT)" || { install -d -m 750 -o artemis -g artemis /var/cache/artemis && \
+	  runuser -u artemis -- env HOME=/var/lib/artemis ARTEMIS_CACHE_DIR=/var/cache/artemis $(CURDIR)/$(BIN)/artemis-edge warm-up; }
 	@test -n "$(ROOT)" || { systemctl daemon-reload; sysctl -q --system; udevadm control --reload; }
 	@echo "edit /etc/artemis/rig.toml, name the LiDAR's port in /etc/systemd/network/20-artemis-lidar.network, then:"
 	@echo "  systemctl enable --now artemis-can0 artemis-edge"

@@ -23,6 +23,7 @@ from artemis_edge.commands import (
     texture,
     tui,
     view,
+    warm_up,
 )
 from artemis_edge.commands.common import BAD_USE, DONE, FELL_SHORT, Handler, command, json_option, print_json
 from artemis_edge.errors import InputError, UserError
@@ -110,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
         session.add,
         replay.add,
         run.add,
+        warm_up.add,
         models.add,
         rig.add,
         calibrate.add,

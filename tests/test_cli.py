@@ -212,3 +212,21 @@ def test_simulate_writes_a_session(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (out / "truth" / "trajectory.tum").is_file()
     assert main([*arguments, "--set", "speed"]) == 2
     assert "write it as key=value" in capsys.readouterr().err
+
+
+def test_warm_up_says_where_the_kernels_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from artemis_edge._jit import cache_dir
+    from artemis_edge.session import stream_mapping
+
+    asked = []
+
+    def warm_up(config: object, folder: Path, questions: bool) -> float:
+        asked.append((folder.parent.is_dir(), questions))
+        return 2.6
+
+    monkeypatch.setattr(stream_mapping, "warm_up", warm_up)
+    assert main(["warm-up"]) == 0
+    assert asked == [(True, True)]
+    assert capsys.readouterr().out == f"ready after 3 s; kept in {cache_dir()}\n"
