@@ -11,7 +11,7 @@ import pytest
 from artemis_edge.frames import CameraModel
 from artemis_edge.refinement import texels as tx
 from artemis_edge.refinement.camera import make_camera, sees_sphere, to_camera, to_pixel, view_bounds
-from artemis_edge.refinement.reliability import Trust, geometric, photometric, sample
+from artemis_edge.refinement.reliability import PARTS, Trust, geometric, photometric, sample, takes_no_part
 from artemis_edge.refinement.texel_pages import pack_charts, unpack_charts
 
 TRUST = Trust(40.0, 0.02, 0.1, 400.0, 16.0, 0.2, 0.03)
@@ -60,8 +60,8 @@ def test_discounted_texels_stay_known() -> None:
     texels = tx.allocate(1e6)
     at = texels.chart[tx.add_chart(texels, tx.chart_key(1, 2, 3, 0), 0), tx.AT]
     texels.texel[at : at + 4, 3] = (0, 5, 160, 65535)
-    tx.discount(texels, 16)
-    assert texels.texel[at : at + 4, 3].tolist() == [0, 1, 10, 4095]
+    tx.discount(texels, 100)
+    assert texels.texel[at : at + 4, 3].tolist() == [0, 5, 100, 100]
 
 
 def test_a_surface_that_wavers_about_a_border_keeps_its_chart() -> None:
@@ -119,6 +119,13 @@ def test_weights_are_those_of_equations_9_to_11() -> None:
     assert photometric(50.0**2, 1e12, TRUST) == pytest.approx(math.exp(-0.5 * (50 / 40) ** 2))
     assert photometric(50.0**2, 0.0, TRUST) == 1.0
     assert photometric(50.0**2, 1.0, TRUST) > photometric(50.0**2, 4.0, TRUST)
+
+
+def test_every_part_of_the_surface_has_its_turn() -> None:
+    for number in (0, 5, 1_000_003):
+        turns = [not takes_no_part(number, 7, stamp) for stamp in range(PARTS)]
+        assert sum(turns) == 7
+        assert not takes_no_part(number, PARTS, 3)
 
 
 def test_sampling_is_bilinear() -> None:

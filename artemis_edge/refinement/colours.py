@@ -49,6 +49,12 @@ def shades(photo: Photo, pixel: F32) -> F32:
     return np.interp(away * photo.inverse_r2, steps, photo.shade).astype(np.float32)
 
 
+def little_known(store: Store, seen: Observations, least: float) -> Observations:
+    """The observations of vertices whose colour has less information than ``least``."""
+    few = store.attribute[seen.slot, INFORMATION] < least
+    return Observations(*(column[few] for column in seen))
+
+
 def exposure_of(store: Store) -> float:
     """Factor on the map's colours that leaves all but ``_MAY_CLIP`` of the coloured vertices in memory below 255.
 

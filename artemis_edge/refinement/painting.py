@@ -22,6 +22,7 @@ from artemis_edge.refinement.reliability import (
     reach_of,
     sample,
     shade_at,
+    takes_no_part,
 )
 from artemis_edge.refinement.texels import (
     AT,
@@ -38,7 +39,7 @@ from artemis_edge.refinement.texels import (
     place_key,
     refine_chart,
 )
-from artemis_edge.refinement.visible import NEAR_M, Visible
+from artemis_edge.refinement.visible import NEAR_M, Visible, facing
 
 # Triangles are widened by so many texels: none falls between two of them, and hardly any is painted twice
 WIDEN = 0.02
@@ -117,19 +118,20 @@ def paint(
 ) -> int:
     """Update the texels of the listed triangles with what ``photo`` shows; returns how many were updated.
 
-    ``share`` of 64 parts of the voxels take part, others in other frames. Texels that hold at least ``enough``
+    ``share`` of ``PARTS`` parts of the voxels take part, others in other frames. Texels that hold at least ``enough``
     information (as stored) are left as they are.
     """
     updated = 0
     for t in range(visible.length[2]):
-        cosine = visible.cosine[t]
-        if cosine < trust.least_cosine:
-            continue
-        if share < 64 and ((visible.owner[t] * 37 + stamp * 11) & 63) >= share:
+        if takes_no_part(visible.owner[t], share, stamp):
             continue
         if not _is_in_view(visible, t, photo.camera):
             continue
-        updated += _paint_triangle(texels, visible, t, vertex, photo, trust, brush, stamp, enough)
+        i, j, k = visible.triangle[t, 0], visible.triangle[t, 1], visible.triangle[t, 2]
+        cosine = facing(visible.point[i], visible.point[j], visible.point[k])
+        if cosine < trust.least_cosine:
+            continue
+        updated += _paint_triangle(texels, visible, t, cosine, vertex, photo, trust, brush, stamp, enough)
     return updated
 
 
@@ -187,6 +189,7 @@ def _paint_triangle(
     texels: TexelStore,
     visible: Visible,
     t: int,
+    cosine: float,
     vertex: F32,
     photo: Photo,
     trust: Trust,
@@ -219,7 +222,7 @@ def _paint_triangle(
                 updated += _paint_chart(
                     texels,
                     chart,
-                    visible.cosine[t],
+                    cosine,
                     b,
                     c,
                     direction,

@@ -64,7 +64,7 @@ def decode(image: CameraImage, refused: Refused) -> U8 | None:
     """RGB uint8 (h, w, 3), or None for an image that cannot be used."""
     data = np.frombuffer(image.encoded, np.uint8)
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
     except cv2.error:
         pixels = None
     if pixels is None:
@@ -78,8 +78,7 @@ def decode(image: CameraImage, refused: Refused) -> U8 | None:
     if np.mean((few > _BLACK) & (few < _CLIPPED)) < _LEAST_USABLE:
         refused.add("images_black_or_clipped", image, "it is black or clipped nearly everywhere")
         return None
-    rgb: U8 = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-    return rgb
+    return np.asarray(pixels, np.uint8)
 
 
 @dataclass(slots=True)

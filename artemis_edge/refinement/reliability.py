@@ -26,6 +26,8 @@ from artemis_edge.refinement.visible import Depth, Visible
 _DEPTH_REACH = 1.5
 # Surfaces so steep that they change by more than this share of their distance within that reach hide themselves
 _STEEPEST = 0.3
+#: In how many parts the surface is divided, of which an image takes some
+PARTS = 64
 # Levels from which a channel is clipped, and below which a pixel is lost in the dark, with what they weigh then
 CLIPPED, CLIPPED_WEIGHT = 250.0, 0.1
 _BLACK, _BLACK_WEIGHT = 4.0, 0.3
@@ -99,6 +101,12 @@ def photometric(r2: float, information: float, trust: Trust) -> float:
 
 
 @kernel
+def takes_no_part(number: int, share: int, stamp: int) -> bool:
+    """Whether what has this number is not among ``share`` of ``PARTS``; others are with other stamps."""
+    return share < PARTS and ((int(number) * 37 + stamp * 11) & (PARTS - 1)) >= share
+
+
+@kernel
 def reach_of(camera: Camera, depth: Depth, nx: float, ny: float, distance: float) -> float:
     """Change of nearness within the depth map's resolution on the plane n . x = ``distance`` (camera frame)."""
     per_pixel = abs(nx) / camera.fx + abs(ny) / camera.fy
@@ -168,13 +176,16 @@ def new_observations(n: int) -> Observations:
     )
 
 
-def observe(store: Store, visible: Visible, photo: Photo, trust: Trust) -> Observations:
+def observe(
+    store: Store, visible: Visible, photo: Photo, trust: Trust, share: int = PARTS, stamp: int = 0
+) -> Observations:
     """How ``photo`` sees the listed vertices: those in view and not hidden; colours as the camera gave them.
 
+    Of vertices that have a colour only ``share`` of ``PARTS`` take part, others with another ``stamp``.
     :func:`weigh` fills ``reliability``.
     """
     out = new_observations(int(visible.length[1]))
-    n = observe_vertices(store, visible, photo, trust, out)
+    n = observe_vertices(store, visible, photo, trust, share, stamp, out)
     return Observations(
         out.slot[:n],
         out.pixel[:n],
@@ -188,15 +199,20 @@ def observe(store: Store, visible: Visible, photo: Photo, trust: Trust) -> Obser
 
 
 @kernel
-def observe_vertices(store: Store, visible: Visible, photo: Photo, trust: Trust, out: Observations) -> int:
+def observe_vertices(
+    store: Store, visible: Visible, photo: Photo, trust: Trust, share: int, stamp: int, out: Observations
+) -> int:
     """Fill ``out`` but for ``reliability``; returns how many rows."""
     n, camera = 0, photo.camera
+    coloured = store.attribute.shape[1] > INFORMATION
     right, bottom = camera.width - 1.0, camera.height - 1.0
     for i in range(visible.length[1]):
         u, v, near = visible.pixel[i, 0], visible.pixel[i, 1], visible.pixel[i, 2]
         if not (0.0 <= u < right and 0.0 <= v < bottom):  # NaN is not
             continue
         s, p = visible.slot[i], visible.point[i]
+        if coloured and takes_no_part(s, share, stamp) and store.attribute[s, INFORMATION] > 0.0:
+            continue
         nx, ny, nz = _turn(camera.R, store.vertex[s])
         away = nx * p[0] + ny * p[1] + nz * p[2]
         cosine = -away / math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])

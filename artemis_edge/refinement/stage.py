@@ -15,11 +15,11 @@ from artemis_edge.frames import F32, F64, CameraImage, TrackedFrame
 from artemis_edge.lens import log_falloff
 from artemis_edge.refinement import texels as tx
 from artemis_edge.refinement.atlas_builder import build_atlas
-from artemis_edge.refinement.colours import exposure_of, update_vertices
+from artemis_edge.refinement.colours import exposure_of, little_known, update_vertices
 from artemis_edge.refinement.exposure import SHADES, Exposures, undoing
 from artemis_edge.refinement.painting import new_brush, paint
 from artemis_edge.refinement.photographs import Keyframes, Refused, Waiting, arrivals, decode
-from artemis_edge.refinement.reliability import Trust, new_observations
+from artemis_edge.refinement.reliability import PARTS, Trust, new_observations
 from artemis_edge.refinement.texel_pages import TexelPages
 from artemis_edge.refinement.view import View, Viewer
 from artemis_edge.voxel_map import VoxelMap
@@ -28,10 +28,10 @@ from artemis_edge.voxel_map import VoxelMap
 _UNMESHED = 0.1
 _EVERYTHING = 1 << 16  # more than any texel's information as stored
 _LEARNT = (4, 8, 16, 32)  # keyframes after which the lenses' fall-off is found
-_LITTLE = 0.25  # good observations, below which keyframes are asked again
-_PARTS = 64  # of the surface, by which ``share`` is told
-# Change of a lens's fall-off, in logarithm, from which on colours taken with the old one must give way, and by how much
-_NOTABLE, _GIVE_WAY = 0.05, 16
+_LITTLE = 4.0  # good observations, below which keyframes are asked again at the end
+# Change of a lens's fall-off, in logarithm, from which on colours taken with the old one must give way, and what they
+# are worth then, in good observations
+_NOTABLE, _GIVE_WAY = 0.05, 0.1
 
 
 def trust_of(config: RefinementConfig) -> Trust:
@@ -152,16 +152,15 @@ class Refinement:
         steps = np.linspace(0.0, 1.0, SHADES)
         change = [log_falloff(a - self._falloff.get(name, 0.0 * a), steps) for name, a in falloff.items()]
         if self._looks > 0 and max(float(np.abs(c).max()) for c in change) > _NOTABLE:
-            tx.discount(self.texels, _GIVE_WAY)
+            tx.discount(self.texels, int(_GIVE_WAY * tx.INFORMATION_SCALE))
         self._falloff = falloff
         self._shades = {name: undoing(a) for name, a in falloff.items()}
 
     def _learn(self, waiting: Waiting, view: View) -> None:
         """Keep what a keyframe says of exposures; from time to time find the lenses' fall-off anew."""
-        if self._config.vignetting and len(self._exposures) < _LEARNT[-1]:
-            self._exposures.add(waiting.image.name, waiting.image.model, view.seen)
-            if len(self._exposures) in _LEARNT:
-                self._set_falloff(self._exposures.solve()[1])
+        self._exposures.add(waiting.image.name, waiting.image.model, view.seen)
+        if len(self._exposures) in _LEARNT:
+            self._set_falloff(self._exposures.solve()[1])
 
     def _fuse(self, waiting: Waiting, enough: int, gain: F32 | None = None, learn: bool = False) -> None:
         pixels = decode(waiting.image, self.refused)
@@ -169,15 +168,21 @@ class Refinement:
             return
         self._looks += 1
         model = waiting.image.model
-        view = self.viewer.look(pixels, model, waiting.T_world_cam, sharpness(waiting.image, waiting.twist))
+        clear = sharpness(waiting.image, waiting.twist)
+        learn = learn and self._config.vignetting and len(self._exposures) < _LEARNT[-1]
+        some = None if learn or gain is not None else self._looks
+        view = self.viewer.look(pixels, model, waiting.T_world_cam, clear, some)
         if learn:
             self._learn(waiting, view)
         view = self.viewer.weigh(view, gain, self._shades.get(waiting.image.name))
         store, voxel_m = self._map.store, self._map.config.voxel_m
-        if enough == _EVERYTHING:
-            spacing = model.fx * voxel_m / 4
-            update_vertices(store, view.seen, spacing, view.photo.sharpness, self.trust)
-        part = _PARTS if gain is not None or enough != _EVERYTHING else self._part()
+        seen = (
+            view.seen
+            if enough == _EVERYTHING
+            else little_known(store, view.seen, _LITTLE / self.trust.noise2)
+        )
+        update_vertices(store, seen, model.fx * voxel_m / 4, view.photo.sharpness, self.trust)
+        part = PARTS if gain is not None or enough != _EVERYTHING else self._part()
         painted = paint(
             self.texels,
             view.visible,
@@ -189,12 +194,12 @@ class Refinement:
             part,
             enough,
         )
-        self._in_view = painted * _PARTS / part
+        self._in_view = painted * PARTS / part
 
     def _part(self) -> int:
-        """How many of ``_PARTS`` of the surface the next image colours, by how much the last one had in view."""
+        """How many of ``PARTS`` of the surface the next image colours, by how much the last one had in view."""
         wanted = self.share * self._config.most_texels / max(self._in_view, 1.0)
-        return int(min(max(round(wanted * _PARTS), 1), _PARTS))
+        return int(min(max(round(wanted * PARTS), 1), PARTS))
 
 
 def sharpness(image: CameraImage, twist: F64) -> float:

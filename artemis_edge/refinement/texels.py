@@ -168,11 +168,10 @@ def refine_chart(texels: TexelStore, chart: int, level: int) -> bool:
     return True
 
 
-def discount(texels: TexelStore, by: int) -> None:
-    """Divide the information of all texels in memory by ``by``: what comes next outweighs them."""
+def discount(texels: TexelStore, most: int) -> None:
+    """Leave no texel in memory more information than ``most`` (as stored): what comes next outweighs them."""
     used = texels.texel[: int(texels.counter[N_TEXELS]), 3]
-    known = used > 0
-    used[known] = np.maximum(used[known] // np.uint16(by), 1)
+    np.minimum(used, np.uint16(most), out=used)
 
 
 @kernel

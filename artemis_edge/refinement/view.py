@@ -12,10 +12,11 @@ from artemis_edge.lens import corner_radius2
 from artemis_edge.refinement.camera import Camera, make_camera, view_bounds
 from artemis_edge.refinement.colours import estimate_gain
 from artemis_edge.refinement.exposure import SHADES
-from artemis_edge.refinement.reliability import Observations, Photo, Trust, observe, weigh
+from artemis_edge.refinement.reliability import PARTS, Observations, Photo, Trust, observe, weigh
 from artemis_edge.refinement.visible import Visible, depth_map, list_visible, new_visible, unmeshed
 
 _ONES = np.ones(SHADES, np.float32)
+_ENOUGH = 8000  # vertices: many times what an image's exposure needs
 _DEPTH_WIDTH = 320  # pixels of the reference depth map, about: finer ones lose nothing that matters
 
 
@@ -43,13 +44,26 @@ class Viewer:
         camera = self._camera(model, T_world_cam)
         return float(unmeshed(self._store, camera, self._voxel_m, self._far_m))
 
-    def look(self, image: U8, model: CameraModel, T_world_cam: F64, sharpness: float = 1.0) -> View:
-        """View of ``image`` uint8 (h, w, 3) RGB taken at ``T_world_cam`` (4, 4) with the map as it is now."""
+    def look(
+        self,
+        image: U8,
+        model: CameraModel,
+        T_world_cam: F64,
+        sharpness: float = 1.0,
+        stamp: int | None = None,
+    ) -> View:
+        """View of ``image`` uint8 (h, w, 3) RGB taken at ``T_world_cam`` (4, 4) with the map as it is now.
+
+        With a ``stamp`` about ``_ENOUGH`` of the vertices that have a colour are observed, others with another one.
+        """
         camera = self._camera(model, T_world_cam)
         self._visible = list_visible(self._store, camera, self._voxel_m, self._far_m, self._visible)
         depth = depth_map(self._visible, camera, max(round(model.width / _DEPTH_WIDTH), 1))
         photo = Photo(camera, image, depth, _ONES[:3], _ONES, 1.0 / corner_radius2(model), sharpness)
-        seen = observe(self._store, self._visible, photo, self.trust)
+        share = PARTS
+        if stamp is not None:
+            share = max(min(PARTS * _ENOUGH // max(int(self._visible.length[1]), 1), PARTS), 1)
+        seen = observe(self._store, self._visible, photo, self.trust, share, stamp or 0)
         return View(self._visible, photo, seen)
 
     def weigh(self, view: View, gain: F32 | None = None, shade: F32 | None = None) -> View:

@@ -45,7 +45,6 @@ class Visible(NamedTuple):
     pixel: F32  # (n, 3) u, v and nearness 1 / z; NaN where not in front of the camera
     place: I32  # (cells,) row of a cell slot; counts only where ``slot`` of that row names it back
     triangle: I32  # (m, 3) rows of vertices
-    cosine: F32  # (m,) of the angle between normal and line of sight; negative seen from behind
     owner: I32  # (m,) voxel slot
     neighbour: I32  # (27,)
     length: I32  # (3,) voxels, vertices, triangles
@@ -60,7 +59,6 @@ def new_visible(store: Store, voxels: int = 1024, vertices: int = 8192, triangle
         pixel=np.empty((vertices, 3), np.float32),
         place=np.zeros(len(store.state), np.int32),
         triangle=np.empty((triangles, 3), np.int32),
-        cosine=np.empty(triangles, np.float32),
         owner=np.empty(triangles, np.int32),
         neighbour=np.empty(27, np.int32),
         length=np.zeros(3, np.int32),
@@ -80,11 +78,7 @@ def list_visible(store: Store, camera: Camera, voxel_m: float, far_m: float, w: 
         w = w._replace(slot=np.empty(room, np.int32), point=point, pixel=pixel)
     if triangles > len(w.triangle):
         room = int(triangles * _ROOM)
-        w = w._replace(
-            triangle=np.empty((room, 3), np.int32),
-            cosine=np.empty(room, np.float32),
-            owner=np.empty(room, np.int32),
-        )
+        w = w._replace(triangle=np.empty((room, 3), np.int32), owner=np.empty(room, np.int32))
     w.length[0] = n
     w.length[1] = list_vertices(store, camera, n, w)
     w.length[2] = list_triangles(store, n, w)
@@ -210,15 +204,17 @@ def list_triangles(store: Store, voxels: int, w: Visible) -> int:
             if a < 0 or b < 0 or c < 0 or math.isnan(w.pixel[a, 0] + w.pixel[b, 0] + w.pixel[c, 0]):
                 continue
             w.triangle[m, 0], w.triangle[m, 1], w.triangle[m, 2] = a, b, c
-            w.cosine[m] = _facing(w.point[a], w.point[b], w.point[c])
             w.owner[m] = v
             m += 1
     return m
 
 
 @kernel
-def _facing(a: F32, b: F32, c: F32) -> float:
-    """Cosine between a triangle's normal and the direction to the camera; 0 without area."""
+def facing(a: F32, b: F32, c: F32) -> float:
+    """Cosine between a triangle's normal and the direction to the camera, of corners in camera coordinates.
+
+    Negative seen from behind; 0 without area.
+    """
     ux, uy, uz = np.float64(b[0]) - a[0], np.float64(b[1]) - a[1], np.float64(b[2]) - a[2]
     vx, vy, vz = np.float64(c[0]) - a[0], np.float64(c[1]) - a[1], np.float64(c[2]) - a[2]
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
