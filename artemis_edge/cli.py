@@ -214,6 +214,14 @@ def _reprocess(commands: Any) -> None:
         "--continue", type=Path, metavar="MAP", dest="go_on",
         help="recognise the place in a map made before and extend that map, in its frame",
     )  # fmt: skip
+    parser.add_argument(
+        "--jobs", type=_at_least_one, metavar="N",
+        help="of several inputs, how many are mapped at a time (default: what cores and memory allow)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--cluster", default="", metavar="ADDRESS",
+        help="map on the workers of a Dask cluster, for example tcp://10.0.0.5:8786 (extra 'cluster')",
+    )  # fmt: skip
     json_option(parser)
 
 
@@ -260,6 +268,12 @@ def _span(text: str) -> tuple[int, int | None]:
     if not colon or start < 0 or (stop is not None and stop <= start):
         raise argparse.ArgumentTypeError(f"'{text}' is not A:B with 0 <= A < B, for example 0:100")
     return start, stop
+
+
+def _at_least_one(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
+    return int(text)
 
 
 def _at_least_two(text: str) -> int:
@@ -331,6 +345,8 @@ def run_reprocess(given: argparse.Namespace) -> int:
             for path, out in batch.places(given.inputs, given.out)
         ],
         plain=given.json,
+        jobs=given.jobs,
+        cluster=given.cluster,
     )
     reports = {str(outcome.out): outcome.report for outcome in outcomes}
     if given.json:

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ class Terminal:
         folder: Path,
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self._server = f"artemis-edge-test-{os.getpid()}-{time.monotonic_ns()}"
+        self._own = tempfile.TemporaryDirectory(prefix="terminal")  # short: a socket's path is
         self._code = folder / "exit-code"
         given = {"COLORTERM": "truecolor", "XDG_STATE_HOME": str(folder), "XDG_CONFIG_HOME": str(folder)}
         settings = [f"{name}={value}" for name, value in {**given, **(environment or {})}.items()]
@@ -66,6 +67,7 @@ class Terminal:
 
     def __exit__(self, *_: object) -> None:
         self._tmux("kill-server")
+        self._own.cleanup()
 
     def text(self) -> str:
         """What is on the screen."""
@@ -104,7 +106,11 @@ class Terminal:
 
     def _tmux(self, *words: str) -> str:
         return subprocess.run(
-            ["tmux", "-L", self._server, *words], capture_output=True, text=True, check=True, timeout=20
+            ["tmux", "-S", f"{self._own.name}/tmux", *words],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=20,
         ).stdout
 
 

@@ -233,6 +233,7 @@ def test_several_inputs_have_folders_of_their_own(
 ) -> None:
     out = tmp_path / "out"
     arguments = ["reprocess", str(kitti), str(kitti), "--out", str(out), "--frames", "0:3", "--json"]
+    arguments += ["--jobs", "1"]
     assert main(arguments) == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
     assert sorted(runs) == [str(out / "00"), str(out / "00_2")]
