@@ -137,7 +137,7 @@ def test_what_a_killed_run_left_is_cleared(tmp_path: Path) -> None:
 def dask() -> Iterator[Any]:
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp"
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0", protocol="tcp"
     ) as made:
         yield made
 

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 _NAMES = ("a", "b", "c", "d")
-_PATIENCE_S = 60.0
+_PATIENCE_S = 60.0 * float(os.environ.get("ARTEMIS_PATIENCE", "1"))
 
 
 @pytest.fixture
@@ -28,12 +28,22 @@ def dask(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """A scheduler on the loopback address and two workers without a nanny: what is killed stays dead."""
     pytest.importorskip("distributed")
     file = tmp_path / "scheduler.json"
-    scheduler = _start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+    scheduler = _start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0",
                        "--scheduler-file", str(file), folder=tmp_path)  # fmt: skip
     _wait(lambda: file.exists() and bool(file.read_text().strip()))
     address = json.loads(file.read_text())["address"]
     workers = [
-        _start("dask_worker", address, "--no-nanny", "--nthreads", "1", "--name", name, folder=tmp_path)
+        _start(
+            "dask_worker",
+            address,
+            "--no-nanny",
+            "--no-dashboard",
+            "--nthreads",
+            "1",
+            "--name",
+            name,
+            folder=tmp_path,
+        )
         for name in ("first", "second")
     ]
     yield address, workers
