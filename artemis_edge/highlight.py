@@ -28,6 +28,9 @@ from artemis_edge.segmentation.select import Selection, select
 GAP_M = 0.3  # parts of one class nearer than this are one object: a bench's slats, a person behind a pole
 LEAST_AREA_M2 = 0.05  # smaller pieces are stray labels: a mask's edge on what lies behind
 LEAST_SCORE = 0.5  # below it the map does not say that the object is there
+_ENOUGH_SEEN = (
+    0.5  # share of an object that images need to have seen: nobody photographs things from all sides
+)
 _NOT_SEEN = 180  # grey of vertices that no camera has coloured
 
 
@@ -103,16 +106,25 @@ def pieces(vertices: F32, faces: I32, gap_m: float = GAP_M) -> I32:
 def _object(mesh: Mesh, probability: F32, name: str, rows: I64, area: F64, number: int) -> MapObject:
     faces, weight = mesh.faces[rows], area[rows] / area[rows].sum()
     middle = mesh.vertices[faces].mean(axis=1).astype(np.float64)
-    score = float(probability[faces].mean(axis=1) @ weight)
     return MapObject(
         id=number,
-        classes={name: min(score, 1.0)},
+        classes={name: _score(probability[faces], weight)},
         colour=_colour(mesh, faces, weight),
         box=upright_box(mesh.vertices[np.unique(faces)]),
         centroid=weight @ middle,
         triangles=rows,
         area_m2=float(area[rows].sum()),
     )
+
+
+def _score(probability: F32, weight: F64) -> float:
+    """Mean probability of the corners (k, 3) that images have seen, by area; less where they are less than enough."""
+    share = (probability > 0.0) * weight[:, None] / 3.0
+    seen = float(share.sum())
+    if seen == 0.0:
+        return 0.0
+    mean = float((probability * share).sum()) / seen
+    return min(mean * min(seen / _ENOUGH_SEEN, 1.0), 1.0)
 
 
 def _colour(mesh: Mesh, faces: I32, weight: F64) -> F64 | None:

@@ -74,6 +74,20 @@ def test_answers_are_ranked_and_what_is_unsure_is_not_claimed() -> None:
     assert len(alone.vertices) == 4 and alone.vertices[:, 0].min() == 3.0
 
 
+def test_the_far_side_of_a_thing_counts_neither_for_it_nor_against_it() -> None:
+    """Two triangles over corners 0 1 2 and 0 2 3: corners 0 and 2 weigh a third each, the others a sixth."""
+    mesh = world(sheet(0, 1))
+    for probability, score in (
+        ((0.8, 0.8, 0.8, 0.8), 0.8),
+        ((0.8, 0.0, 0.8, 0.0), 0.8),
+        ((0.9, 0.0, 0.0, 0.0), 0.6),  # a third is two thirds of enough
+        ((0.0, 0.6, 0.0, 0.0), 0.2),
+        ((0.0, 0.0, 0.0, 0.0), 0.0),
+    ):
+        (found,) = objects_of(mesh, np.array(probability, np.float32))
+        assert found.classes["car"] == pytest.approx(score), probability
+
+
 def test_every_second_image_of_a_camera_is_due_whatever_frame_it_comes_in() -> None:
     due = every_image(2, 3)
     image = CameraImage("cam_0", 0, b"", CameraModel(8, 8, 8.0, 8.0, 4.0, 4.0), np.eye(4))
