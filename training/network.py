@@ -12,10 +12,21 @@ _HALF, _QUARTER, _EIGHTH, _SIXTEENTH, _THIRTY_SECOND = 16, 32, 56, 80, 96
 _EXPANSION = 3
 
 
+class _Pointwise(nn.Conv2d):
+    """A 1 x 1 convolution, which learns as a product of matrices: torch's own takes twice as long on one thread."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training:
+            return super().forward(x)
+        return functional.linear(x.permute(0, 2, 3, 1), self.weight[:, :, 0, 0], self.bias).permute(
+            0, 3, 1, 2
+        )
+
+
 def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    kind = _Pointwise if kernel == stride == groups == 1 else nn.Conv2d
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False),
-        nn.BatchNorm2d(outputs),
+        kind(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False), nn.BatchNorm2d(outputs)
     )
 
 
@@ -91,7 +102,7 @@ class Network(nn.Module):
         self.to_sixteenth = _Joined(_THIRTY_SECOND, _SIXTEENTH, 48)
         self.to_eighth = _Joined(48, _EIGHTH, 40)
         self.to_quarter = _Joined(40, _QUARTER, 40)
-        self.logits = nn.Conv2d(40, 4 * classes, 1)
+        self.logits = _Pointwise(40, 4 * classes, 1)
 
     def forward(self, picture: Tensor) -> Tensor:
         """Logits of every second pixel along each axis."""

@@ -14,10 +14,10 @@ U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 Rng = np.random.Generator
 
-INPUT = (320, 256)  # width, height that whole views are scaled to for the network
-CROP = (256, 192)
-_SCALE = (0.5, 1.0)  # of the views, whose crops these are
-_SOUGHT_SCALE = (0.6, 1.6)  # of crops that look for a class
+INPUT = (480, 384)  # width, height that whole views are scaled to for the network
+CROP = (288, 224)
+_SCALE = (0.65, 1.1)  # of the views, whose crops these are
+_SOUGHT_SCALE = (0.65, 1.4)  # of crops that look for a class
 _ASIDE = 60  # pixels of the view that such a crop's middle is beside a pixel of the class at most
 #: How often crops look for a class, relative to each other (0.5 where not named).
 _SOUGHT = {

@@ -1,10 +1,11 @@
 """Trains the network on rendered views and writes its weights.
 
     python training/train.py --views VIEWS --check OTHER_VIEWS --out WEIGHTS.pt [--steps N] [--seed N]
-        [--start WEIGHTS.pt] [--sought SHARE] [--rate RATE]
+        [--start WEIGHTS.pt] [--sought SHARE] [--rate RATE] [--minutes M]
 
 One thread; equal arguments and views, equal weights on equal machines. The weights so far are written now and
-then, so that a long training can be looked at.
+then, so that a long training can be looked at. With ``--minutes`` the rate falls to 0 within that time however slow
+the machine is; how many steps that gives, and so the weights, depend on the machine.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from samples import Views, batch, whole
 from torch import Tensor, nn
 from torch.nn import functional
 
-_BATCH = 8
+_BATCH = 6
 _RATE, _DECAY = 3e-3, 0.02  # AdamW's learning rate at its highest, and weight decay
-_WARM_UP = 0.05  # of all steps
-_AVERAGED = 0.99  # the weights kept are a running mean of those learnt
+_WARM_UP, _FALL = 0.02, 0.5  # share of the training in which the rate rises, and from which on it falls
+_AVERAGED = 0.995  # the weights kept are a running mean of those learnt
 _RARE = 0.3  # power of a class's share of pixels by which it weighs less
 _REPORT_EVERY, _WRITE_EVERY = 50, 250
 
@@ -53,20 +54,44 @@ def epochs(count: int, rng: np.random.Generator) -> Iterator[int]:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How long and from where to learn; ``sought`` is the share of crops that look for a class."""
+    """How long and from where to learn; ``sought`` is the share of crops that look for a class.
+
+    Learning ends after ``steps`` batches or ``minutes`` of wall time, whichever comes first; 0 is no limit of time.
+    """
 
     steps: int
+    minutes: float
     seed: int
     sought: float
     rate: float
     start: Path | None
 
 
+class Clock:
+    """How much of a plan is done."""
+
+    def __init__(self, how: Plan) -> None:
+        self._how, self._began, self._cpu_began = how, time.monotonic(), time.process_time()
+
+    def done(self, step: int) -> float:
+        """0 to 1, and more than 1 where the time is over."""
+        spent = (time.monotonic() - self._began) / (60 * self._how.minutes) if self._how.minutes else 0.0
+        return max(step / self._how.steps, spent)
+
+    def cpu_s(self) -> float:
+        """CPU time since the start."""
+        return time.process_time() - self._cpu_began
+
+
+def rate_share(done: float) -> float:
+    """Share of the highest rate when so much of the training is done: a rise, a plateau, a straight fall to 0."""
+    return min((done + 1e-3) / _WARM_UP, 1.0, max(1.0 - done, 0.0) / (1.0 - _FALL))
+
+
 def train(views: Views, how: Plan, out: Path) -> Network:
-    """The network after ``how.steps`` batches; its weights are written to ``out``."""
-    steps, seed = how.steps, how.seed
-    torch.manual_seed(seed)
-    rng = np.random.default_rng([seed, 91])
+    """The network after learning by the plan; its weights are written to ``out``."""
+    torch.manual_seed(how.seed)
+    rng = np.random.default_rng([how.seed, 91])
     network = Network(len(NETWORK_CLASSES)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if how.start is not None:
         network.load_state_dict(torch.load(how.start))
@@ -75,12 +100,12 @@ def train(views: Views, how: Plan, out: Path) -> Network:
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(_AVERAGED), use_buffers=True
     )
     optimiser = torch.optim.AdamW(_groups(network), lr=how.rate)
-    plan = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, how.rate, total_steps=steps, pct_start=_WARM_UP, cycle_momentum=False
-    )
-    order, began, total = epochs(len(views), rng), time.process_time(), 0.0
+    order, clock, total = epochs(len(views), rng), Clock(how), 0.0
     network.train()
-    for step in range(steps):
+    step, done = 0, 0.0
+    while done < 1.0:
+        for group in optimiser.param_groups:
+            group["lr"] = how.rate * rate_share(done)
         picture, label = batch(views, rng, [next(order) for _ in range(_BATCH)], how.sought)
         down, right = rng.integers(0, 2, 2)  # each logit stands for four pixels, which teach it in turns
         taught = torch.from_numpy(label[:, down::2, right::2].astype(np.int64))
@@ -90,14 +115,17 @@ def train(views: Views, how: Plan, out: Path) -> Network:
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 2.0)
         optimiser.step()
-        plan.step()
         mean.update_parameters(network)
         total += float(loss.detach())
-        if (step + 1) % _REPORT_EVERY == 0:
-            spent = time.process_time() - began
-            print(f"{step + 1}/{steps}: loss {total / _REPORT_EVERY:.4f}, {spent:.0f} s CPU", flush=True)
+        step += 1
+        done = clock.done(step)
+        if step % _REPORT_EVERY == 0:
+            print(
+                f"{step} ({done:.0%}): loss {total / _REPORT_EVERY:.4f}, {clock.cpu_s():.0f} s CPU",
+                flush=True,
+            )
             total = 0.0
-        if (step + 1) % _WRITE_EVERY == 0 or step + 1 == steps:
+        if step % _WRITE_EVERY == 0 or done >= 1.0:
             torch.save(mean.module.state_dict(), out)
     learnt = mean.module
     assert isinstance(learnt, Network)
@@ -132,6 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--check", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=2400)
+    parser.add_argument("--minutes", type=float, default=0.0, help="of wall time at most (default: no limit)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--rate", type=float, default=_RATE, help="learning rate at its highest")
@@ -141,7 +170,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     views = Views(list(given.views.glob("*.npz")))
     print(f"{len(views)} views", flush=True)
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    network = train(views, Plan(given.steps, given.seed, given.sought, given.rate, given.start), given.out)
+    how = Plan(given.steps, given.minutes, given.seed, given.sought, given.rate, given.start)
+    network = train(views, how, given.out)
     for world in sorted({p.name.split("-")[0] for p in given.check.glob("*.npz")}):
         table = confusion(network, Views(list(given.check.glob(f"{world}-*.npz"))))
         there = table.sum(axis=1) > 0
