@@ -17,6 +17,7 @@ from artemis_edge.session.messages import (
     Header,
     Image,
     Imu,
+    ImuTemplate,
     LivoxCustomMsg,
     Message,
     Odometry,
@@ -215,3 +216,12 @@ def test_other_encapsulations_are_refused() -> None:
         CdrReader(b"\x00\x03\x00\x00abcd")
     with pytest.raises(CdrError, match="nothing"):
         CdrReader(b"")
+
+
+def test_samples_by_their_template_are_the_same_bytes() -> None:
+    template = ImuTemplate("imu")
+    rng = np.random.default_rng(4)
+    for stamp_ns in (0, 1_700_000_000_123_456_789, 5):
+        gyro, accel = rng.normal(size=(2, 3))
+        expected = Imu(Header(stamp_ns, "imu"), gyro, accel).encode()
+        assert template.encode(stamp_ns, gyro.tolist(), accel.tolist()) == expected

@@ -14,6 +14,7 @@ from artemis_edge import topics
 from artemis_edge.frames import F64, CameraModel
 from artemis_edge.service.settings import RunConfig, device_name
 from artemis_edge.session.assembly import RigTopics
+from artemis_edge.session.cdr import Buffer
 from artemis_edge.session.message_ring import MessageRing
 from artemis_edge.session.messages import Header, Message, RawPackets, Text, TFMessage, TransformStamped
 from artemis_edge.session.writer import camera_info
@@ -38,14 +39,20 @@ class Outlet:
 
     def send(self, topic: str, message: Message, stamp_ns: int, rx_ns: int | None = None) -> None:
         """A message measured at session time ``stamp_ns`` and received at host time ``rx_ns`` (None: now)."""
+        if self.is_open:
+            self.send_encoded(topic, message.ROS_TYPE, message.encode(), stamp_ns, rx_ns)
+
+    def send_encoded(
+        self, topic: str, ros_type: str, data: Buffer, stamp_ns: int, rx_ns: int | None = None
+    ) -> None:
+        """As ``send``, of a message that is encoded already."""
         if not self.is_open:
             return
-        data = message.encode()
         with self._lock:
             received = time.monotonic_ns() if rx_ns is None else rx_ns
             self._last_ns = max(self._last_ns, received + self.wall_ns)
             try:
-                self.ring.publish(topic, message.ROS_TYPE, self._last_ns, stamp_ns, data)
+                self.ring.publish(topic, ros_type, self._last_ns, stamp_ns, data)
             except ValueError:
                 self.too_large += 1
                 return

@@ -75,7 +75,8 @@ class ScanCutter:
         if self._offset_ns is None:
             return []
         stamps = (slots["stamp_ns"] + self._offset_ns).tolist()
-        return list(zip(stamps, slots["rx_ns"].tolist(), slots["gyro"], slots["accel"], strict=True))
+        columns = slots["rx_ns"], slots["gyro"].astype(np.float64), slots["accel"].astype(np.float64)
+        return list(zip(stamps, *(column.tolist() for column in columns), strict=True))
 
     def cut(self, start_ns: int) -> Cloud:
         """The points of the window from ``start_ns`` on; what is older is dropped."""

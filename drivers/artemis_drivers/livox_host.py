@@ -21,7 +21,7 @@ from artemis_drivers.livox_slots import CLOCK_NAMES, IMU_SLOT, POINT_SLOT
 from artemis_drivers.ring import Ring, RingMaker
 from artemis_drivers.udp import PACKET, RECEIVE_BUFFER, PacketReceiver, open_udp, receive_buffer_warning
 
-POLL_S = 0.004  # 10 packets of an Avia; the kernel has stamped them on arrival
+POLL_S = 0.01  # 25 packets of an Avia; the kernel has stamped them on arrival
 _BATCH = 256
 _STOP_S = 1.5
 _UTC_FIRST, _UTC_END = 946_684_800 * 10**9, 9_025_257_600 * 10**9  # years 2000 to 2255, ns since 1970

@@ -20,6 +20,7 @@ CHUNK_BYTES = 4096
 IMU_CHUNK = np.dtype([("rx_ns", "i8"), ("size", "i4"), ("data", "u1", (CHUNK_BYTES,))])
 """Bytes as they arrived: ``rx_ns`` is host monotonic time."""
 
+_MOST_LOST = int(np.iinfo(np.int32).max)
 SILENT_S = 0.5  # a running IMU sends hundreds of samples a second
 
 
@@ -136,7 +137,7 @@ class SerialImu(DeviceThread):
                 "rx_ns": rx_ns,
                 "device_ns": reading.device_ns,
                 "count": reading.count,
-                "lost": min(reading.lost, np.iinfo(np.int32).max),
+                "lost": min(reading.lost, _MOST_LOST),
                 "boot": reading.boot,
                 "gyro": sample.gyro,
                 "accel": sample.accel,

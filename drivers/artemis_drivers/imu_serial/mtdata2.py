@@ -11,6 +11,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 
 from artemis_drivers.imu_serial.stream import NEED_MORE, NO_FRAME
 
@@ -118,6 +119,7 @@ _WHOLE: dict[int, struct.Struct] = {
     Type.STATUS_BYTE: struct.Struct(">B"),
     Type.STATUS_WORD: struct.Struct(">I"),
 }
+_CODES = {int(Precision.FLOAT32): "f", int(Precision.FLOAT64): "d"}
 _BYTES_OF_REAL = {
     Precision.FLOAT32: 4,
     Precision.FP12_20: 4,
@@ -239,17 +241,26 @@ def encode_items(items: Sequence[Item]) -> bytes:
 
 
 def _decode_item(data_id: int, content: bytes) -> Item:
-    kind = data_id & _TYPE_BITS
-    if layout := _WHOLE.get(kind):
+    if layout := _layout(data_id):
         if layout.size != len(content):
             raise MalformedError(f"MTData2 item {data_id:04X} of {len(content)} bytes")
         return Item(data_id, layout.unpack(content))
-    if count := _REALS.get(kind):
+    if count := _REALS.get(data_id & _TYPE_BITS):
         precision = Precision(data_id & _PRECISION_BITS)
         if len(content) != count * _BYTES_OF_REAL[precision]:
             raise MalformedError(f"MTData2 item {data_id:04X} of {len(content)} bytes")
         return Item(data_id, decode_reals(content, precision))
     return Item(data_id, raw=content)
+
+
+@lru_cache(256)  # a stream repeats some ten items hundreds of times a second
+def _layout(data_id: int) -> struct.Struct | None:
+    """Of items that ``struct`` can read; None for fixed-point numbers and unknown items."""
+    kind = data_id & _TYPE_BITS
+    code = _CODES.get(data_id & _PRECISION_BITS)
+    if kind in _REALS:
+        return None if code is None else struct.Struct(f">{_REALS[kind]}{code}")
+    return _WHOLE.get(kind)
 
 
 def _encode_item(item: Item) -> bytes:
