@@ -22,7 +22,7 @@ from artemis_drivers.livox_slots import (
     track,
 )
 from artemis_drivers.ring import Ring, RingReader
-from artemis_drivers.udp import PACKET, packet_bytes
+from artemis_drivers.udp import PACKET, joined_bytes, packet_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -367,7 +367,11 @@ def test_window_of_nothing() -> None:
 
 def test_raw_packets_stay_readable() -> None:
     data = [random_packet(k, np.random.default_rng(k)) for k in TYPES]
-    assert packet_bytes(slots(feed([(0, d) for d in data]).packets)) == data
+    packets = slots(feed([(0, d) for d in data]).packets)
+    assert packet_bytes(packets) == data and joined_bytes(packets) == b"".join(data)
+    alike = slots(feed([(0, data[0]), (1, data[0])]).packets)
+    assert joined_bytes(alike) == data[0] * 2
+    assert joined_bytes({name: rows[:0] for name, rows in alike.items()}) == b""
 
 
 def test_more_packets_than_slots_keep_the_newest() -> None:

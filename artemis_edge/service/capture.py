@@ -19,7 +19,7 @@ from artemis_drivers.livox_slots import Cloud
 from artemis_drivers.ring import RingReader
 from artemis_drivers.trigger.events import Kind
 from artemis_drivers.trigger.messages import Opcode
-from artemis_drivers.udp import packet_bytes
+from artemis_drivers.udp import joined_bytes
 
 from artemis_edge import topics
 from artemis_edge.frame_pairing import CameraTiming, FrameStamp
@@ -460,4 +460,4 @@ class _RawFeeds:
             return
         _, rows = reader.read()
         ids = rows["id"] if "id" in rows else np.zeros(len(rows["rx_ns"]), np.uint32)
-        self._outlet.raw(topic, name, rows["rx_ns"], ids, rows["size"], b"".join(packet_bytes(rows)))
+        self._outlet.raw(topic, name, rows["rx_ns"], ids, rows["size"], joined_bytes(rows))

@@ -122,8 +122,12 @@ class RingReader:
         self._skip_to(ring.oldest())
         stop = ring.published if limit is None else min(ring.published, self.next + limit)
         first = self.next
-        rows = np.arange(first, stop) % ring.slots
-        copy = {name: array[rows] for name, array in ring.field.items()}
+        start, end = first % ring.slots, first % ring.slots + stop - first
+        if end <= ring.slots:
+            copy = {name: array[start:end].copy() for name, array in ring.field.items()}
+        else:
+            rows = np.arange(first, stop) % ring.slots
+            copy = {name: array[rows] for name, array in ring.field.items()}
         overwritten = min(max(0, ring.oldest() - first), stop - first)
         self._skip_to(first + overwritten)
         self.next = max(self.next, stop)

@@ -142,7 +142,8 @@ class PacketReceiver:
         ring, size, rx = self.ring, self.ring.field["size"], self.ring.field["rx_ns"]
         limit = min(limit, ring.slots)
         first = ring.claim(limit)
-        self._real_minus_monotonic = time.time_ns() - time.monotonic_ns()
+        began = time.monotonic_ns()
+        self._real_minus_monotonic = time.time_ns() - began
         count = 0
         for _ in range(limit):
             row = (first + count) % ring.slots
@@ -152,7 +153,7 @@ class PacketReceiver:
                 break
             except ConnectionRefusedError:  # an earlier answer of ours met a closed port
                 continue
-            rx[row] = self._stamp(ancillary)
+            rx[row] = self._stamp(ancillary, began)
             if flags & _TRUNCATED:
                 self.truncated += 1
             elif self.sender is not None and source[0] != self.sender:
@@ -163,7 +164,8 @@ class PacketReceiver:
         ring.publish(count, touched=count + 1)  # a datagram not taken lies in the next slot
         return count
 
-    def _stamp(self, ancillary: list[tuple[int, int, bytes]]) -> int:
+    def _stamp(self, ancillary: list[tuple[int, int, bytes]], began: int) -> int:
+        """When a datagram arrived; most of them before the draining ``began``."""
         stamp = 0
         for _, kind, data in ancillary:
             if kind == _SO_TIMESTAMPNS:
@@ -171,6 +173,8 @@ class PacketReceiver:
                 stamp = seconds * 1_000_000_000 + nanoseconds - self._real_minus_monotonic
             elif kind == _SO_RXQ_OVFL:
                 self.kernel_drops = array.array("I", data)[0]
+        if began - _MAX_AGE_NS < stamp <= began:
+            return stamp
         now = time.monotonic_ns()
         if now - _MAX_AGE_NS < stamp <= now + 1_000_000:
             return min(stamp, now)
@@ -181,3 +185,11 @@ class PacketReceiver:
 def packet_bytes(packets: dict[str, NDArray[np.generic]]) -> list[bytes]:
     """The datagrams of slots read from a packet ring, as bytes."""
     return [row[:n].tobytes() for row, n in zip(packets["data"], packets["size"].tolist(), strict=True)]
+
+
+def joined_bytes(packets: dict[str, NDArray[np.generic]]) -> bytes:
+    """All of them, one after the other; in one copy where they are of one size, as a LiDAR's are."""
+    size = packets["size"]
+    if len(size) and bool((size == size[0]).all()):
+        return packets["data"][:, : int(size[0])].tobytes()
+    return b"".join(packet_bytes(packets))
