@@ -193,6 +193,7 @@ class LiveMapper:
             "latest_ns": self.mapping.latest_ns,
             "frame_ms": round(float(np.median(times)), 1) if times else 0.0,
             "frame_ms_list": [round(t, 1) for t in times],
+            "cpu_ms_list": [round(t, 1) for t in statistics.cpu_ms[-_LATEST:]],
             "stages_ms": {name: round(ms, 1) for name, ms in self.mapping.mapper.stage_ms.items()},
             "waiting": feed.ring.published - feed.next,
             "from_files": feed.from_files,

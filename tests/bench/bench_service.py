@@ -88,17 +88,21 @@ def watch(seconds: float, control: Path, pid: int) -> dict[str, Any]:
     """Counts and times between two looks."""
     first, before, start = ask(control, do="state")["result"], cpu_by_thread(pid), time.monotonic()
     times: dict[int, float] = {}
+    cpus: dict[int, float] = {}
     state = first
     while time.monotonic() - start < seconds:
         time.sleep(1.0)
         state = ask(control, do="state")["result"]
         mapping = mapped(state)
         latest = mapping.get("frame_ms_list", [])
-        for k, ms in enumerate(latest):
+        for k, (ms, cpu_ms) in enumerate(zip(latest, mapping.get("cpu_ms_list", []), strict=True)):
             times[mapping["mapped"] - len(latest) + k] = ms
+            cpus[mapping["mapped"] - len(latest) + k] = cpu_ms
     wall = time.monotonic() - start
     after = cpu_by_thread(pid)
-    new = [ms for frame, ms in times.items() if frame >= mapped(first).get("mapped", 0)]
+    since = mapped(first).get("mapped", 0)
+    new = [ms for frame, ms in times.items() if frame >= since]
+    new_cpu = [ms for frame, ms in cpus.items() if frame >= since]
     share = {name: round((s - before.get(name, 0.0)) / wall * 100, 2) for name, s in after.items()}
     cpu: dict[str, float] = defaultdict(float)
     for name in ("recorder", "mapping", "segmentation"):
@@ -112,6 +116,7 @@ def watch(seconds: float, control: Path, pid: int) -> dict[str, Any]:
         "others_percent": dict(cpu),
         "frames": len(new),
         "frame_ms": {q: round(float(np.percentile(new, q)), 1) for q in (50, 99)} if new else {},
+        "frame_cpu_ms": {q: round(float(np.percentile(new_cpu, q)), 1) for q in (50, 99)} if new else {},
         "behind_s": mapped(state).get("behind_s"),
         "masks": mapped(state).get("masks", 0) - mapped(first).get("masks", 0),
         "lost": {
