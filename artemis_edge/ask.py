@@ -23,13 +23,14 @@ from artemis_edge.highlight import Reply, answer, objects_of
 from artemis_edge.opened_map import map_folder
 from artemis_edge.progress import Report, silent
 from artemis_edge.questions import Questions, unanswered
+from artemis_edge.refinement.agreement import agreed
 from artemis_edge.refinement.semantics import labels_of, refine_rows
 from artemis_edge.segmentation.backend import Segmentation
 from artemis_edge.segmentation.keyframes import Keyframe, read_keyframes, segment_all
 from artemis_edge.segmentation.registry import open_by_name
 from artemis_edge.segmentation.yolo_seg import Thresholds
-from artemis_edge.semantic_map import BACKGROUND, active_slots, reliability, slot_layers, spread_labels
-from artemis_edge.sight import compare_depth, new_seen, new_sight, see_rows, splat_depth
+from artemis_edge.semantic_map import BACKGROUND, active_slots, slot_layers, spread_labels, visibility
+from artemis_edge.sight import cell_px, keep_visible, new_seen, new_sight, see_rows, splat_depth
 from artemis_edge.voxel_fusion import grid_of, sample_scores
 
 
@@ -83,19 +84,20 @@ class MeshBrush:
         """Eqs 12 and 13 for what a photograph sees; returns how many vertices it sees."""
         sight, seen, dense = new_sight(keyframe.model, keyframe.T_world_cam), self._seen, found.dense
         n = int(see_rows(self._rows, sight.T_cam_world, sight.lens, self._config.reach_m, seen))
-        splat_depth(seen, n, sight.lens[0], self._spacing_m, sight.depth)
-        compare_depth(seen, n, sight.depth)
+        splat_depth(seen, n, sight.lens[0], self._spacing_m, cell_px(sight.lens), sight.depth)
+        n = int(keep_visible(seen, n, cell_px(sight.lens), sight.depth, visibility(self._config)))
         sampled = np.empty((n, dense.score.shape[2]), np.float32)
         sample_scores(seen, n, dense.score, grid_of(dense), sampled)
-        weight = reliability(seen, n, self._config.sigma_geom)
-        refine_rows(self._attribute, seen, n, sampled, slot_layers(dense), weight, self._scratch)
+        refine_rows(self._attribute, seen, n, sampled, slot_layers(dense), seen.reliability, self._scratch)
         return n
 
     def labelled(self) -> tuple[Mesh, F32]:
         """The mesh with the labels found, and the probability of each vertex' label (0 where nothing was seen)."""
         label, probability = np.zeros(len(self._rows), np.uint8), np.zeros(len(self._rows), np.float32)
-        labels_of(self._attribute[:, LOG_CLASS:], self._active, label, probability, self._scratch)
-        mesh = self._mesh
+        mesh, lam = self._mesh, self._attribute[:, LOG_CLASS:]
+        weight = self._config.agreement
+        lam = agreed(lam, self._active, mesh.vertices, mesh.normals, mesh.faces, self._spacing_m, weight)
+        labels_of(lam, self._active, label, probability, self._scratch)
         label = spread_labels(label, probability > 0.0, mesh.normals, mesh.faces, self._config.spread_rings)
         return replace(mesh, labels=label, label_names=self._names), probability
 

@@ -250,6 +250,14 @@ class SemanticsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     sigma_geom: Annotated[
         float, _float("sigma_geom of eq. 9 for classes: relative depth error.", ge=0.001, le=1.0)
     ] = 0.03
+    agreement: Annotated[
+        float,
+        _float(
+            "How much vertices of one surface give way to each other's classes in the finished mesh; 0: not.",
+            ge=0.0,
+            le=100.0,
+        ),
+    ] = 3.0
     spread_rings: Annotated[
         int,
         Meta(

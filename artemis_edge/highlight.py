@@ -20,6 +20,7 @@ from artemis_edge.evaluate.sampling import triangle_areas
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F32, F64, I32, I64, Bool
 from artemis_edge.highlighted import face_labels
+from artemis_edge.segmentation.attribute import usual_sizes
 from artemis_edge.segmentation.backend import Status
 from artemis_edge.segmentation.layout import Box
 from artemis_edge.segmentation.resolve import Understanding
@@ -27,6 +28,8 @@ from artemis_edge.segmentation.select import Selection, select
 
 GAP_M = 0.3  # parts of one class nearer than this are one object: a bench's slats, a person behind a pole
 LEAST_AREA_M2 = 0.05  # smaller pieces are stray labels: a mask's edge on what lies behind
+# Nor is a piece claimed to be a thing of which it shows less than this share of the smallest one's side (sizes.toml)
+LEAST_SHARE = 0.1
 LEAST_SCORE = 0.5  # below it the map does not say that the object is there
 _ENOUGH_SEEN = (
     0.5  # share of an object that images need to have seen: nobody photographs things from all sides
@@ -88,9 +91,17 @@ def objects_of(mesh: Mesh, probability: F32, skip: Sequence[str] = ()) -> list[M
         piece = pieces(mesh.vertices, mesh.faces[rows])
         size = np.bincount(piece, area[rows])
         for k in np.argsort(-size, kind="stable"):
-            if size[k] >= LEAST_AREA_M2:
+            if size[k] >= least_area_m2(name):
                 out.append(_object(mesh, probability, name, rows[piece == k], area, len(out) + 1))
     return out
+
+
+def least_area_m2(name: str) -> float:
+    """Surface below which a piece of a class is a stray label [m2]."""
+    usual = usual_sizes().get(name)
+    if usual is None:
+        return LEAST_AREA_M2
+    return max(LEAST_AREA_M2, LEAST_SHARE * usual["height"][0] * usual["length"][0])
 
 
 def pieces(vertices: F32, faces: I32, gap_m: float = GAP_M) -> I32:

@@ -51,7 +51,7 @@ def gather_mesh(
     faces = renumber[faces]
     labels = np.zeros(n, np.uint8)
     if semantics is not None and lam is not None:
-        labels = semantics.finished_labels(lam[used], normal[used], faces)
+        labels = semantics.finished_labels(lam[used], position[used], normal[used], faces)
     return Mesh(
         vertices=position[used],
         normals=normal[used],

@@ -19,13 +19,15 @@ from artemis_edge.errors import InputError
 from artemis_edge.forgetting import Forgotten, forget_blocks
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraImage
 from artemis_edge.paging import resident_blocks
-from artemis_edge.refinement.semantics import labels_of, refine
+from artemis_edge.refinement.agreement import agreed
+from artemis_edge.refinement.semantics import LEAST_RELIABILITY, labels_of, refine
 from artemis_edge.segmentation.backend import DenseScores
 from artemis_edge.sight import (
-    Seen,
     Sight,
-    compare_depth,
+    Visibility,
+    cell_px,
     empty_depth,
+    keep_visible,
     look,
     new_seen,
     new_sight,
@@ -33,10 +35,9 @@ from artemis_edge.sight import (
     without_depth,
 )
 from artemis_edge.trajectory import inverse
-from artemis_edge.voxel_fusion import fuse, grid_of, sample_scores, start_from
+from artemis_edge.voxel_fusion import MOST_SIGMAS, fuse, grid_of, sample_scores, start_from
 
 BACKGROUND = "background"
-_LEAST_COSINE = 0.05  # surfaces seen at a smaller one show a pixel of something else
 _SAME_SURFACE = 0.7  # cosine between normals
 
 
@@ -83,7 +84,6 @@ class SemanticMap:
         self._blocks = np.empty(len(store.block), np.int32)
         self._seen = new_seen(len(store.state))
         self._sampled = np.empty((len(store.state), CLASSES), np.float32)
-        self._reliability = np.empty(len(store.state), np.float32)
         self._scratch = np.empty(CLASSES, np.float32)
         self.probability = np.empty(0, np.float32)
 
@@ -129,19 +129,18 @@ class SemanticMap:
         if not self.asked:
             return without_depth(view)
         n = self._look(view)
-        splat_depth(self._seen, n, view.lens[0], self._spacing_m, view.depth)
+        splat_depth(self._seen, n, view.lens[0], self._spacing_m, cell_px(view.lens), view.depth)
         return view
 
     def fuse(self, mask: LateMask, stamp: int) -> int:
         """Voxel fusion (eq. 1) of a mask; returns how many vertices it sees."""
         n = self._look(mask.sight)
-        depth = mask.sight.depth
-        if (
-            depth.size == 0
-        ):  # an image from before the question: what stood in its way is what the map knows now
-            depth = empty_depth(mask.sight.lens)
-            splat_depth(self._seen, n, mask.sight.lens[0], self._spacing_m, depth)
-        compare_depth(self._seen, n, depth)
+        lens, depth = mask.sight.lens, mask.sight.depth
+        if depth.size == 0:
+            # an image from before the question: what stood in its way is what the map knows now
+            depth = empty_depth(lens)
+            splat_depth(self._seen, n, lens[0], self._spacing_m, cell_px(lens), depth)
+        n = int(keep_visible(self._seen, n, cell_px(lens), depth, visibility(self.config)))
         sampled = self._rows(n, mask.scores)
         sample_scores(self._seen, n, mask.scores.score, grid_of(mask.scores), sampled)
         fuse(
@@ -157,7 +156,6 @@ class SemanticMap:
 
     def refine(self, mask: LateMask, n: int, stamp: int) -> int:
         """Semantic refinement (eqs 12, 13) by the mask that was fused last and saw ``n`` vertices."""
-        self._reliability[:n] = reliability(self._seen, n, self.config.sigma_geom)
         return int(
             refine(
                 self.store,
@@ -165,19 +163,22 @@ class SemanticMap:
                 n,
                 self._rows(n, mask.scores),
                 slot_layers(mask.scores),
-                self._reliability,
+                self._seen.reliability,
                 stamp,
                 self._scratch,
             )
         )
 
-    def finished_labels(self, lam: F32, normals: F32, faces: I32) -> U8:
-        """Labels (n,) of a finished mesh from log-probabilities (n, CLASSES).
+    def finished_labels(self, lam: F32, vertices: F32, normals: F32, faces: I32) -> U8:
+        """Labels (n,) of a finished mesh from log-probabilities (n, CLASSES), refined by what neighbours agree on.
 
         A vertex that no image saw takes its class from the seen surface around it, up to ``spread_rings`` edges
         away and not around corners. ``probability`` (n,) is then that of each seen vertex' class, 0 of others.
         """
         label, probability = np.zeros(len(lam), np.uint8), np.zeros(len(lam), np.float32)
+        if self.config.refinement:
+            weight = self.config.agreement
+            lam = agreed(lam, self.active, vertices, normals, faces, self._spacing_m, weight)
         labels_of(lam, self.active, label, probability, self._scratch)
         self.probability = probability
         return spread_labels(label, probability > 0.0, normals, faces, self.config.spread_rings)
@@ -191,12 +192,9 @@ class SemanticMap:
         return self._sampled.reshape(-1)[: n * layers].reshape(n, layers)
 
 
-def reliability(seen: Seen, n: int, sigma_geom: float) -> F32:
-    """W of eq. 9 float32 (n,) from the depth alone: r_geom of eq. 11 of the vertices in view; 0 seen from behind."""
-    error = seen.depth_error[:n]
-    relative = error / (np.maximum(seen.z[:n] - error, 0.1) * sigma_geom)
-    weight: F32 = np.exp(-0.5 * relative * relative) * (seen.cosine[:n] > _LEAST_COSINE)
-    return weight.astype(np.float32, copy=False)
+def visibility(config: SemanticsConfig) -> Visibility:
+    """When a vertex is what its pixel shows: for eq. 1 by sigma_d, for eqs 12 and 13 by W."""
+    return Visibility(config.sigma_geom, LEAST_RELIABILITY, MOST_SIGMAS * config.sigma_d_m)
 
 
 def slot_layers(scores: DenseScores) -> I32:

@@ -21,8 +21,15 @@ from artemis_edge.trajectory import inverse
 
 NEAR_M = 0.3  # nearer surfaces fill the image and are blurred
 _FRUSTUM_MARGIN = 1.1  # of the largest line of sight: distortion moves the corners outwards
-# Cells of the depth map that splats are drawn on: one pixel in eight keeps an edge within a vertex' own spacing
-DEPTH_SHARE = 8
+# Angle of a cell of the depth map that splats are drawn on (8 pixels of 1280): at 11 m it is a vertex' own spacing
+CELL_RAD = 1.0 / 112.0
+# Columns of the depth map: depth of the nearest vertex [m], inverse depth of its plane at the cell's centre [1/m] and
+# how that changes from pixel to pixel, to the right and down
+DEPTH, INVERSE, RIGHT, DOWN = range(4)
+# A plane is followed until its depth has changed by this factor; beyond it the cell shows something else, too
+_FARTHEST = 2.0
+# Surfaces seen at a smaller cosine show a pixel of something else, and their planes have no depth to be followed
+LEAST_COSINE = 0.05
 _SPLAT = 0.75  # radius of a splat in point spacings: neighbouring splats overlap and leave no hole
 
 
@@ -31,8 +38,8 @@ class Sight(NamedTuple):
 
     ``T_cam_world`` float64 (3, 4); ``lens`` float64 (12,): fx fy cx cy k1 k2 p1 p2 k3 width height and the squared
     radius within which the lens model holds; ``tangent`` float64 (4,): x / z and y / z, least and most, that the
-    image can show; ``depth`` float32 (h, w) reference depth along z [m], inf where nothing is known, one cell for
-    every ``DEPTH_SHARE`` pixels.
+    image can show; ``depth`` float32 (h, w, 4) the reference depth: the surface nearest to the camera as a plane, with
+    columns DEPTH (inf where nothing is known), INVERSE, RIGHT and DOWN; one cell for every :func:`cell_px` pixels.
     """
 
     T_cam_world: F64
@@ -49,8 +56,11 @@ class Seen(NamedTuple):
     u: F32  # pixel
     v: F32
     z: F32  # depth [m]
+    right: F32  # change of the inverse depth along the vertex' plane, per pixel [1/m]
+    down: F32
     cosine: F32  # between the line of sight and the normal, 0 when seen from behind
     depth_error: F32  # |depth - reference depth| [m], 0 where no reference is known
+    reliability: F32  # W of eq. 9 from the depth alone, 0 where the surface is seen from behind
 
 
 def new_seen(cells: int) -> Seen:
@@ -58,7 +68,7 @@ def new_seen(cells: int) -> Seen:
     return Seen(
         np.empty(cells, np.int32),
         np.empty(cells, np.int32),
-        *(np.empty(cells, np.float32) for _ in range(5)),
+        *(np.empty(cells, np.float32) for _ in range(8)),
     )
 
 
@@ -73,21 +83,28 @@ def new_sight(camera: CameraModel, T_world_cam: F64) -> Sight:
     return Sight(np.ascontiguousarray(inverse(T_world_cam)[:3]), lens, tangent, empty_depth(lens))
 
 
+def cell_px(lens: F64) -> float:
+    """Pixels that a cell of the depth map of a ``Sight.lens`` is wide."""
+    return float(max(round(float(lens[0]) * CELL_RAD), 1))
+
+
 def empty_depth(lens: F64) -> F32:
     """A depth map for a ``Sight.lens`` in which nothing is known."""
-    width, height = int(lens[9]), int(lens[10])
-    return np.full((-(-height // DEPTH_SHARE), -(-width // DEPTH_SHARE)), np.inf, np.float32)
+    size = cell_px(lens)
+    depth = np.zeros((math.ceil(lens[10] / size), math.ceil(lens[9] / size), 4), np.float32)
+    depth[:, :, DEPTH] = np.inf
+    return depth
 
 
 def without_depth(sight: Sight) -> Sight:
     """The view alone: some hundred bytes, of which thousands can be kept."""
-    return sight._replace(depth=np.empty((0, 0), np.float32))
+    return sight._replace(depth=np.empty((0, 0, 4), np.float32))
 
 
 def look(store: Store, sight: Sight, blocks: I32, block_m: float, reach_m: float, seen: Seen) -> int:
     """Living vertices of ``blocks`` (slots) within ``reach_m`` that ``sight`` shows into ``seen``; how many.
 
-    ``depth_error`` is left for :func:`compare_depth`.
+    ``depth_error`` is left for :func:`keep_visible`.
     """
     return int(list_seen(store, sight, blocks, block_m, reach_m, seen))
 
@@ -98,11 +115,11 @@ def list_seen(store: Store, sight: Sight, blocks: I32, block_m: float, reach_m: 
     T, lens = sight.T_cam_world, sight.lens
     n = 0
     for block in blocks:
-        if not _touches_frustum(store, block, sight, block_m, reach_m):
+        if not _touches_view(store.block[block], sight, block_m, reach_m):
             continue
         for inner in range(512):
             voxel = store.block_voxel[block, inner]
-            if voxel < 0:
+            if voxel < 0 or not _touches_view(store.voxel[voxel], sight, block_m / 8.0, reach_m):
                 continue
             mask = store.voxel_mask[voxel]
             while mask != 0:
@@ -128,15 +145,11 @@ def see_rows(vertex: F32, T: F64, lens: F64, reach_m: float, seen: Seen) -> int:
 
 
 @kernel
-def _touches_frustum(store: Store, block: int, sight: Sight, block_m: float, reach_m: float) -> bool:
-    """Whether the sphere around a block reaches into the view."""
+def _touches_view(index: I32, sight: Sight, edge_m: float, reach_m: float) -> bool:
+    """Whether the sphere around a cube (a block, a voxel) of that ``index`` (3,) and edge reaches into the view."""
     T, tangent = sight.T_cam_world, sight.tangent
-    cx, cy, cz = (
-        (store.block[block, 0] + 0.5) * block_m,
-        (store.block[block, 1] + 0.5) * block_m,
-        (store.block[block, 2] + 0.5) * block_m,
-    )
-    radius = 0.8661 * block_m
+    cx, cy, cz = (index[0] + 0.5) * edge_m, (index[1] + 0.5) * edge_m, (index[2] + 0.5) * edge_m
+    radius = 0.8661 * edge_m
     x = T[0, 0] * cx + T[0, 1] * cy + T[0, 2] * cz + T[0, 3]
     y = T[1, 0] * cx + T[1, 1] * cy + T[1, 2] * cz + T[1, 3]
     z = T[2, 0] * cx + T[2, 1] * cy + T[2, 2] * cz + T[2, 3]
@@ -170,40 +183,78 @@ def _project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> b
     v = lens[1] * (y * radial + lens[6] * (r2 + 2.0 * y * y) + 2.0 * lens[7] * x * y) + lens[3]
     if not (u > -0.5 and v > -0.5 and u < lens[9] - 0.5 and v < lens[10] - 0.5):
         return False
-    nx, ny, nz = np.float64(p[NORMAL]), np.float64(p[NORMAL + 1]), np.float64(p[NORMAL + 2])
-    facing = -(
-        (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz) * cx
-        + (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz) * cy
-        + (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz) * z
-    )
+    gx, gy, gz = np.float64(p[NORMAL]), np.float64(p[NORMAL + 1]), np.float64(p[NORMAL + 2])
+    nx = T[0, 0] * gx + T[0, 1] * gy + T[0, 2] * gz
+    ny = T[1, 0] * gx + T[1, 1] * gy + T[1, 2] * gz
+    nz = T[2, 0] * gx + T[2, 1] * gy + T[2, 2] * gz
+    facing = -(nx * cx + ny * cy + nz * z)
+    cosine = facing / (z * math.sqrt(r2 + 1.0))
     seen.u[n], seen.v[n], seen.z[n] = u, v, z
-    seen.cosine[n] = max(facing / (z * math.sqrt(r2 + 1.0)), 0.0)
+    seen.cosine[n] = max(cosine, 0.0)
+    # the inverse depth of a plane is linear in the image: n . ray / n . p
+    steep = cosine < LEAST_COSINE
+    seen.right[n] = 0.0 if steep else -nx / (facing * lens[0])
+    seen.down[n] = 0.0 if steep else -ny / (facing * lens[1])
     return True
 
 
 @kernel
-def splat_depth(seen: Seen, n: int, focal: float, spacing_m: float, depth: F32) -> None:
+def splat_depth(seen: Seen, n: int, focal: float, spacing_m: float, size_px: float, depth: F32) -> None:
     """Reference depth of the vertices in view: each covers a square of its own spacing; the nearest stays."""
-    height, width = depth.shape
+    height, width, _ = depth.shape
     for i in range(n):
         z = seen.z[i]
         half = _SPLAT * spacing_m * focal / z
-        left = max(int((seen.u[i] - half) / DEPTH_SHARE + 0.5), 0)
-        right = min(int((seen.u[i] + half) / DEPTH_SHARE + 0.5), width - 1)
-        top = max(int((seen.v[i] - half) / DEPTH_SHARE + 0.5), 0)
-        bottom = min(int((seen.v[i] + half) / DEPTH_SHARE + 0.5), height - 1)
+        left = max(int((seen.u[i] - half) / size_px + 0.5), 0)
+        right = min(int((seen.u[i] + half) / size_px + 0.5), width - 1)
+        top = max(int((seen.v[i] - half) / size_px + 0.5), 0)
+        bottom = min(int((seen.v[i] + half) / size_px + 0.5), height - 1)
         for row in range(top, bottom + 1):
             for column in range(left, right + 1):
-                if z < depth[row, column]:
-                    depth[row, column] = z
+                cell = depth[row, column]
+                if z < cell[DEPTH]:
+                    du, dv = column * size_px - seen.u[i], row * size_px - seen.v[i]
+                    cell[DEPTH] = z
+                    cell[INVERSE] = 1.0 / z + seen.right[i] * du + seen.down[i] * dv
+                    cell[RIGHT], cell[DOWN] = seen.right[i], seen.down[i]
+
+
+class Visibility(NamedTuple):
+    """When a vertex in view is what its pixel shows."""
+
+    sigma_geom: float  # of eq. 9: relative depth error
+    least_reliability: float  # W below it is as good as 0
+    most_error_m: float  # depth error up to which eq. 1 takes it in
 
 
 @kernel
-def compare_depth(seen: Seen, n: int, depth: F32) -> None:
-    """``depth_error`` of the vertices in view against the reference depth at their pixels."""
-    height, width = depth.shape
+def keep_visible(seen: Seen, n: int, size_px: float, depth: F32, rules: Visibility) -> int:
+    """Compare the vertices in view with the reference depth at their very pixels; only those remain that are what
+    the image shows there, for eq. 1 or for eq. 9. Returns how many; ``depth_error`` and ``reliability`` are set."""
+    kept = 0
     for i in range(n):
-        row = min(max(int(seen.v[i] / DEPTH_SHARE + 0.5), 0), height - 1)
-        column = min(max(int(seen.u[i] / DEPTH_SHARE + 0.5), 0), width - 1)
-        reference = depth[row, column]
-        seen.depth_error[i] = abs(seen.z[i] - reference) if reference < np.inf else np.float32(0.0)
+        error = _depth_error(seen, i, size_px, depth)
+        relative = error / (max(seen.z[i] - error, NEAR_M) * rules.sigma_geom)
+        weight = math.exp(-0.5 * relative * relative) if seen.cosine[i] > LEAST_COSINE else 0.0
+        if error >= rules.most_error_m and weight < rules.least_reliability:
+            continue
+        seen.slot[kept], seen.voxel[kept] = seen.slot[i], seen.voxel[i]
+        seen.u[kept], seen.v[kept], seen.z[kept] = seen.u[i], seen.v[i], seen.z[i]
+        seen.cosine[kept] = seen.cosine[i]
+        seen.depth_error[kept], seen.reliability[kept] = error, weight
+        kept += 1
+    return kept
+
+
+@kernel
+def _depth_error(seen: Seen, i: int, size_px: float, depth: F32) -> float:
+    """|depth - reference depth| of row ``i``, 0 where no reference is known."""
+    row = min(max(int(seen.v[i] / size_px + 0.5), 0), depth.shape[0] - 1)
+    column = min(max(int(seen.u[i] / size_px + 0.5), 0), depth.shape[1] - 1)
+    cell = depth[row, column]
+    if not cell[DEPTH] < np.inf:
+        return 0.0
+    du, dv = seen.u[i] - column * size_px, seen.v[i] - row * size_px
+    inverse = cell[INVERSE] + cell[RIGHT] * du + cell[DOWN] * dv
+    reference = min(max(1.0 / max(inverse, 1e-6), cell[DEPTH] / _FARTHEST), cell[DEPTH] * _FARTHEST)
+    return float(abs(seen.z[i] - reference))

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from artemis_edge.errors import InputError
 from artemis_edge.evaluate.by_class import Score
 from artemis_edge.evaluate.sampling import samples, thin
-from artemis_edge.evaluate.semantics import near_boundary
+from artemis_edge.evaluate.semantics import PARTS, near_boundary
 from artemis_edge.export.mesh import Mesh, PointCloud, finite_rows
 from artemis_edge.frames import U8
 
@@ -49,11 +49,11 @@ def score_boundaries(
 
 
 def merged_labels(reference: PointCloud, names: Mapping[int, str]) -> U8:
-    """Labels of the reference as the map was asked for: 0 for classes that it does not name."""
+    """Labels of the reference as the map was asked for: 0 for what it names neither itself nor the whole of."""
     mine = {name: label for label, name in names.items()}
     table = np.zeros(256, np.uint8)
     for label, name in reference.label_names.items():
-        table[label] = mine.get(name, 0)
+        table[label] = mine.get(name, mine.get(PARTS.get(name, ""), 0))
     assert reference.labels is not None
     return table[reference.labels]
 

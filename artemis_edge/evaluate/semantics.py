@@ -24,6 +24,9 @@ from artemis_edge.frames import F32, I32, I64, U8, Bool
 
 REACH_M = 0.2
 IGNORED = 255
+#: What a person would call the first is, in a labelled cloud, a class of its own: panes are parts of what they are set
+#: in, and a beam or a photograph shows what is behind them as often as the pane.
+PARTS = {"glass": "building"}
 BACKGROUND = 0
 _SPACING_M = 0.03
 _WORKERS = 2
@@ -120,7 +123,8 @@ def near_boundary(points: F32, labels: U8, distance_m: float) -> Bool:
 def evaluate_semantics(mesh: Mesh, reference: PointCloud, boundary_m: float = 0.1) -> SemanticEvaluation:
     """Compare the labels of ``mesh`` with those of ``reference``, by name of the class.
 
-    A class of the reference that the mesh does not name counts as background of the mesh. Raises InputError when
+    A class of the reference that the mesh does not name counts as what it is a part of (a pane of glass as
+    building), else as background of the mesh. Raises InputError when
     the reference has no labels or the two have no class in common.
     """
     if reference.labels is None:
@@ -156,7 +160,8 @@ def _by_name(reference: PointCloud, mesh: Mesh) -> I64:
     mine = {_plain(name): label for label, name in mesh.label_names.items()}
     table = np.full(256, BACKGROUND, np.int64)
     for label, name in reference.label_names.items():
-        table[label] = mine.get(_plain(name), BACKGROUND)
+        part = PARTS.get(_plain(name), "")
+        table[label] = mine.get(_plain(name), mine.get(part, BACKGROUND))
     return table
 
 

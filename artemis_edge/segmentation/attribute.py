@@ -32,13 +32,14 @@ def manifest() -> Manifest:
         file="none",
         sha256="0" * 64,
         licence="part of the program",
-        classes=tuple(_sizes()),
+        classes=tuple(usual_sizes()),
         note="no network: colour, size and shape of pieces of the mesh; answers are approximate",
     )
 
 
 @lru_cache(maxsize=1)
-def _sizes() -> dict[str, dict[str, tuple[float, float]]]:
+def usual_sizes() -> dict[str, dict[str, tuple[float, float]]]:
+    """Height, length and width of each class that sizes.toml lists, least and most [m]."""
     text = (resources.files("artemis_edge.segmentation") / "sizes.toml").read_text("utf-8")
     return {
         name: {side: (float(low), float(high)) for side, (low, high) in sides.items()}
@@ -50,7 +51,7 @@ def shape_scores(box: Box) -> dict[str, float]:
     """How well the size of a box fits each class that sizes.toml lists: 0..1, those of 0 left out."""
     fits = {
         name: min(_fit(box.measure(side), low, high) for side, (low, high) in sides.items())
-        for name, sides in _sizes().items()
+        for name, sides in usual_sizes().items()
     }
     return {name: fit for name, fit in fits.items() if fit > 0.0}
 
@@ -71,11 +72,11 @@ class AttributeBackend:
     @property
     def classes(self) -> tuple[str, ...]:
         """Classes whose size is known."""
-        return tuple(_sizes())
+        return tuple(usual_sizes())
 
     def support(self, text: str) -> Support:
         """APPROXIMATE at best."""
-        if text in _sizes():
+        if text in usual_sizes():
             return Support(
                 Status.APPROXIMATE, f"'{text}' is judged by size and shape only, without a network"
             )

@@ -14,13 +14,12 @@ import numpy as np
 from artemis_drivers.virtual.camera import VirtualCamera, undistort
 from artemis_drivers.virtual.scene import cast_at
 
+from artemis_edge.evaluate.semantics import PARTS
 from artemis_edge.frames import F64, I32, U8
 from artemis_edge.segmentation.backend import FULL_SCORE, DenseScores, Grid
 from artemis_edge.session.rig import START_NS, Rig
 
 _SHARE = 2  # a cell of the masks is so many pixels wide: a network's masks are no finer
-#: What a person would call the first is, in the worlds, a class of its own: panes are parts of what they are set in.
-PARTS = {"glass": "building"}
 _SURE = 0.95  # score of the true class; a perfect network is not one that is never wrong
 
 
