@@ -3,16 +3,29 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 from artemis_edge.cli import main
-from artemis_edge.config import Config, OdometryConfig, load
+from artemis_edge.config import Config, KeepConfig, OdometryConfig, SegmentationConfig, load
 from artemis_edge.continuing import EarlierMap, find_earlier, open_earlier
 from artemis_edge.errors import InputError
 from artemis_edge.export.ply import read_mesh
-from artemis_edge.frames import F64, DeskewedScan, SyncedFrame, TrackedFrame
+from artemis_edge.frames import (
+    F64,
+    CameraImage,
+    CameraModel,
+    DeskewedScan,
+    LidarScan,
+    SyncedFrame,
+    TrackedFrame,
+    Trajectory,
+)
+from artemis_edge.keeper import Keeper
+from artemis_edge.kept_points import open_points
 from artemis_edge.loop.correlation import Correlator
 from artemis_edge.loop.facets import Facets, facets_of
 from artemis_edge.loop.recognition import Recognition
@@ -22,6 +35,7 @@ from artemis_edge.odometry.known_map import KnownMap, Start
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.odometry.local_map import LocalMap
 from artemis_edge.paging import read_pages
+from artemis_edge.segmentation.keyframes import read_keyframes
 from artemis_edge.session import feed
 from artemis_edge.session.stream_mapping import StreamMapping
 from artemis_edge.session.stream_search import StreamSearch
@@ -272,3 +286,37 @@ def test_an_odometry_that_has_not_begun_is_where_it_is_placed() -> None:
     T = _turned(0.3, (4.0, 5.0, 0.0))
     odometry = LidarOdometry(OdometryConfig(), start=Start(T, KnownMap(_houses(1))))
     assert np.allclose(odometry.track(SyncedFrame(0, 0, ())).T_world_lidar, T)
+
+
+def test_points_and_photographs_of_the_earlier_map_stay(tmp_path: Path) -> None:
+    png = cv2.imencode(".png", np.full((4, 6, 3), 128, np.uint8))[1].tobytes()
+    model, poses = (
+        CameraModel(6, 4, 5.0, 5.0, 3.0, 2.0),
+        Trajectory(np.array([0, 10**9]), np.stack([np.eye(4)] * 2)),
+    )
+    folders = [tmp_path / name for name in ("map_1", "map_2")]
+    for run, folder in enumerate(folders):
+        (tmp_path / f"scratch_{run}").mkdir()
+        folder.mkdir()
+        keeper = Keeper(tmp_path / f"scratch_{run}", KeepConfig(), SegmentationConfig())
+        if run:
+            keeper.take_over(folders[0])
+        T = _turned(0.0, (5.0 * run, 0.0, 0.0))
+        scan, image = (
+            LidarScan(np.full((3, 3), run, np.float32), 0),
+            CameraImage("cam", 5, png, model, np.eye(4)),
+        )
+        frame = SyncedFrame(run, 0, (scan,), (image,))
+        moved = (DeskewedScan(scan.points, np.zeros(3)),)
+        tracked = TrackedFrame(run, 0, np.eye(4), moved, images=(image,), image_poses=(T,))
+        keeper.between(lambda frame: frame, SimpleNamespace(tracked=tracked))(frame)
+        keeper.save(folder, poses)
+    kept = open_points(folders[1])
+    assert kept is not None and kept.rows == 6
+    rows = np.concatenate(list(kept.chunks()))
+    assert rows["position"][:, 0].tolist() == [0, 0, 0, 1, 1, 1] and (rows["tick"] == 0).all()
+    index = json.loads((folders[1] / "images.json").read_text())["photos"]
+    assert [entry["file"] for entry in index] == ["images/cam_000000.png", "images/cam_000001.png"]
+    assert all((folders[1] / entry["file"]).read_bytes() == png for entry in index)
+    keyframes = read_keyframes(folders[1])
+    assert sorted(float(k.T_world_cam[0, 3]) for k in keyframes) == [0.0, 5.0]
