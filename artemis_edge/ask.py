@@ -27,6 +27,7 @@ from artemis_edge.refinement.agreement import agreed
 from artemis_edge.refinement.semantics import labels_of, refine_rows
 from artemis_edge.segmentation.backend import Segmentation
 from artemis_edge.segmentation.keyframes import Keyframe, read_keyframes, segment_all
+from artemis_edge.segmentation.query import shown
 from artemis_edge.segmentation.registry import open_by_name
 from artemis_edge.segmentation.yolo_seg import Thresholds
 from artemis_edge.semantic_map import BACKGROUND, active_slots, slot_layers, spread_labels, visibility
@@ -115,7 +116,7 @@ def to_text(replies: Sequence[Reply]) -> str:
     lines = []
     for reply in replies:
         why = f" ({reply.reason})" if reply.reason else ""
-        lines.append(f"{reply.text}: {reply.status.replace('_', ' ')}{why}")
+        lines.append(f"{shown(reply.text)}: {reply.status.replace('_', ' ')}{why}")
         for found in reply.found:
             x, y, z = found.item.centroid
             long, wide, high = found.item.box.size

@@ -15,7 +15,7 @@ from artemis_edge.segmentation.attribute import AttributeBackend, shape_scores
 from artemis_edge.segmentation.backend import Prompt, Segmentation, Status, Support
 from artemis_edge.segmentation.colours import colour_fit
 from artemis_edge.segmentation.layout import Box, between, gap, gap_above, seen_from
-from artemis_edge.segmentation.query import Attribute, Superlative, parse
+from artemis_edge.segmentation.query import Attribute, Superlative, parse, shown
 from artemis_edge.segmentation.resolve import SlotTable, understand
 from artemis_edge.segmentation.select import Selection, select
 from artemis_edge.segmentation.words import canonical, vocabulary
@@ -211,6 +211,12 @@ def test_what_cannot_be_understood_is_told(text: str, reason: str) -> None:
     asked = understand(text, Closed())
     assert asked.status is Status.UNSUPPORTED
     assert select(asked, scene()).status is Status.UNSUPPORTED
+
+
+def test_a_question_is_repeated_without_what_a_terminal_would_obey() -> None:
+    assert shown("red \x1b[2Jcar\n") == "red ?[2Jcar?"
+    assert shown("a" * 10000) == "a" * 200 + "..."
+    assert shown("🚗 Bäume") == "🚗 Bäume"
 
 
 _WORDS = st.sampled_from(

@@ -142,6 +142,12 @@ def parse(text: str) -> Query:
     return Query(text, named)
 
 
+def shown(text: str) -> str:
+    """A question as it may be repeated in a line of text: no longer than one may be, nothing that moves the cursor."""
+    whole = "".join(character if character.isprintable() else "?" for character in text)
+    return whole if len(whole) <= LONGEST_QUESTION else f"{whole[:LONGEST_QUESTION]}..."
+
+
 def tokens(text: str) -> list[str]:
     """Words in lower case; commas and the like are words of their own, other signs are not words."""
     plain = unicodedata.normalize("NFKC", text).lower().replace(_APOSTROPHE, "'")
