@@ -7,12 +7,25 @@ import pytest
 
 from artemis_edge import block_store as bs
 from artemis_edge import range_cube, visibility
-from artemis_edge.block_store import ALIVE, CARVED, CARVED_CELLS, CONFIRMED, COUNT, HITS, SUM, THROUGH, Store
+from artemis_edge.block_store import (
+    ALIVE,
+    CARVED,
+    CARVED_CELLS,
+    CLASSES,
+    CONFIRMED,
+    COUNT,
+    HITS,
+    LOG_CLASS,
+    SUM,
+    THROUGH,
+    Store,
+)
+from artemis_edge.class_rows import CLEAR_LOG
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.frames import F32, F64, Bool, DeskewedScan, TrackedFrame
 from artemis_edge.range_cube import FAR, PIXELS, SPREAD, TILE, TILES, RangeCube
-from artemis_edge.visibility import EVERY, FreeSpace
-from artemis_edge.voxel_map import is_seen_through
+from artemis_edge.visibility import EVERY, MOVED, FreeSpace
+from artemis_edge.voxel_map import VoxelMap, is_seen_through
 from tests import naive
 
 SENSOR = (0.0, 0.0, 1.0)
@@ -261,3 +274,40 @@ def test_the_sensors_own_place_and_empty_scans_are_harmless(tmp_path: Path) -> N
     assert judge.carve(empty, 2) == judge.carve(empty, 3) == 0
     position = mapper.store.vertex[0, :3].astype(np.float64)
     assert judge.carve(naive.frame_of(_wall(rng), position), 2) >= 0
+
+
+def test_movable_things_that_were_looked_through_are_removed_like_one_by_one(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    voxel_map = VoxelMap(VoxelMapConfig(dynamic_filter=True), 1.0, LOG_CLASS + CLASSES)
+    store = voxel_map.store
+    block = bs.find_or_add_block(store, 0, 0, 0)
+    for k in range(8):
+        v = bs.add_voxel(store, block, bs.inner_index(k, 0, 0), k, 0, 0)
+        for c in range(0, 64, 3):
+            s = bs.add_cell(store, v, c)
+            store.state[s] = ALIVE if rng.random() < 0.8 else bs.EVIDENCE_ONLY
+            store.vertex[s, :3] = rng.random(3)
+            store.evidence[s, [THROUGH, CONFIRMED]] = rng.integers(0, 4), rng.integers(0, 30)
+            store.evidence[s, COUNT] = 3.0
+            store.attribute[s, LOG_CLASS:] = -0.5 if rng.random() < 0.3 else -9.0
+            store.attribute[s, LOG_CLASS + int(rng.integers(0, 4))] = 0.0
+    movable = np.zeros(CLASSES, np.uint8)
+    movable[[1, 2]] = 1
+    gone = []
+    for s in np.flatnonzero(store.state == ALIVE):
+        through, confirmed = store.evidence[s, [THROUGH, CONFIRMED]]
+        lam = store.attribute[s, LOG_CLASS:]
+        best = int(lam.argmax())
+        clear = lam[best] - np.delete(lam, best).max() >= CLEAR_LOG
+        if clear and movable[best] and through >= 1 and through >= MOVED * (through + confirmed):
+            gone.append(int(s))
+    assert 5 < len(gone) < (store.state == ALIVE).sum()
+    places = store.vertex[gone, :3].copy()
+    space = FreeSpace(voxel_map.config, voxel_map)
+    store.block[block, bs.SEEN] = 0
+    assert space.remove_movable(movable, 3) == len(gone)
+    assert (store.state[gone] == CARVED).all() and not store.evidence[gone, COUNT].any()
+    assert (store.evidence[gone, THROUGH] >= 1).all(), "what was looked through stays known"
+    assert (store.state == CARVED).sum() == len(gone)
+    assert sorted(map(tuple, space.removed.tolist())) == sorted(map(tuple, places.tolist()))
+    assert space.remove_movable(movable, 4) == 0
