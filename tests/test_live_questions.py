@@ -35,6 +35,7 @@ from artemis_edge.status import QueryStatus
 from tests import networks
 from tests.test_segmentation_worker import png
 from tests.test_semantic_map import small_store
+from tests.waiting import until
 
 SECOND = 10**9
 CAMERA = CameraModel(160, 120, 100.0, 100.0, 79.5, 59.5)
@@ -108,6 +109,18 @@ def test_masks_wait_for_the_frame_of_their_image_and_lose_what_is_forgotten() ->
     for _ in range(40):
         masks.ready()
     assert masks.lost == {"masks_without_frame": 1} and masks.fused == 1
+
+
+def test_no_frame_fuses_more_than_a_few() -> None:
+    masks = LateMasks()
+    masks.asked = asked(car=1)
+    masks.offer(image(1.0), new_sight(CAMERA, np.eye(4)))
+    for _ in range(5):
+        masks.take(pack_mask("cam", SECOND, CAR, scores(1)))
+    assert [len(masks.ready()) for _ in range(4)] == [2, 2, 1, 0]
+    for _ in range(5):
+        masks.take(pack_mask("cam", SECOND, CAR, scores(1)))
+    assert len(masks.drain()) == 5 and masks.fused == 10
 
 
 def test_of_old_images_the_view_is_kept_without_its_depth() -> None:
@@ -330,8 +343,7 @@ def test_a_new_question_is_looked_for_in_old_photographs_too() -> None:
         bench.segmenter.turn()
     bench.masks()
     bench.channel.say({"do": "asked", "asked": asked(car=1, bench=2).plain()})
-    while bench.segmenter.turn():
-        pass
+    assert until(lambda: not bench.segmenter.turn() and not bench.segmenter.looking_back)
     assert bench.masks() == [3.0, 2.0, 1.0, 0.0]
     assert bench.painter.asked[-4:] == [("bench",)] * 4, "cars were looked for there already"
     bench.segmenter.ask(asked(car=1, bench=2, tree=3))

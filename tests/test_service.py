@@ -13,17 +13,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from artemis_edge import topics
+from artemis_edge.config import Config
 from artemis_edge.export.ply_reader import read_ply
 from artemis_edge.segmentation.registry import STORE_VARIABLE, Addition, Registry, file_hash
 from artemis_edge.service.control import default_path
 from artemis_edge.session.feed import messages
 from artemis_edge.session.replay import replay
+from artemis_edge.session.stream_mapping import warm_up
 from artemis_edge.session.verify import verify
 from artemis_edge.session.wire_replay import WireRig, read
 from tests import networks, small_session
@@ -93,9 +96,13 @@ def played(
 ) -> Iterator[tuple[Path, _Service, dict[str, Any]]]:
     """One run for all: a walk of two seconds, the mapping killed in the middle of it."""
     tmp = tmp_path_factory.mktemp("run")
-    red_and_green = networks.photograph()[:, :, ::-1]
+    red_and_green = np.zeros((48, 64, 3), np.uint8)  # BGR
+    red_and_green[:, :28, 2] = red_and_green[:, 36:, 1] = 255
     walk = read(small_session.write(tmp / "walk", frames=25, points=3000, photograph=red_and_green))
     session, seen = tmp / "recorded", dict[str, Any]()
+    warm_up(
+        Config(), tmp / "warm-up", questions=True
+    )  # nobody waits for compilers with a patience of its own
     with reserved(), WireRig(walk, tmp / "rig") as rig:
         _keep_few_images(rig.folder / "rig.toml")
         service = _Service(rig, session, tmp)

@@ -41,6 +41,7 @@ _POLL_S = 0.02
 _SAY_S = 0.5
 _KEYFRAME_NS = 1_000_000_000
 _MOST_KEYFRAMES = 256  # of a camera, some 30 MB; beyond it every second one goes
+_BACK_S = 0.1  # between two old photographs: the mapping fuses a few masks a frame
 _ANSWER_S = 1.0
 _REST = 3.0  # answers are looked for again after so many times what the last ones took
 _NS = 1e9
@@ -114,7 +115,7 @@ class LiveSegmenter:
         self._last: dict[str, int] = {}
         self._times: list[tuple[float, float]] = []  # of the latest masks: when, CPU ms
         self._turn_back = False
-        self._said = self._answered = 0.0
+        self._said = self._answered = self._back_s = 0.0
         self._rest_s = _ANSWER_S
         self._told: list[dict[str, Any]] = []
         self._stopped = False
@@ -183,8 +184,10 @@ class LiveSegmenter:
 
     def _back(self) -> bool:
         """One old photograph."""
-        if not self.looking_back:
+        now = time.monotonic()
+        if not self.looking_back or now - self._back_s < _BACK_S:
             return False
+        self._back_s = now
         back = self.looking_back[0]
         self._segment(back.photos.pop(0), back.prompts)
         back.done += 1

@@ -23,6 +23,7 @@ from artemis_edge.sight import Sight, without_depth
 
 _RECENT = 40  # views of a camera whose depth map is kept: some seconds
 _PATIENCE = 30  # frames that a mask waits for the frame of its image
+_MOST_A_FRAME = 2  # are fused: no frame waits for a network that looks back fast
 _DEFLATE = 1  # masks are mostly one value: the fastest level makes them a tenth
 _MOST_CELLS = 1 << 24
 Key = tuple[str, int]  # camera, stamp
@@ -85,7 +86,9 @@ class LateMasks:
         for mask in self._waiting:
             sight = self._views.get(mask.key)
             mask.turns += 1
-            if sight is not None:
+            if sight is not None and not last and len(out) >= _MOST_A_FRAME:
+                left.append(mask)
+            elif sight is not None:
                 out += self._current(mask, sight)
             elif last or mask.turns > _PATIENCE:
                 self.lost["masks_without_frame"] += 1

@@ -124,6 +124,10 @@ def watch(seconds: float, control: Path, pid: int) -> dict[str, Any]:
             **{d["name"]: d["counters"].get("points_lost", 0) for d in state["devices"]},
         },
         "reduced": state["session"].get("reduced"),
+        "segmentation": {
+            k: v for k, v in (state["session"].get("segmentation") or {}).items() if k != "answers"
+        },
+        "queries": {q["text"]: [q["status"], q["count"], q["score"]] for q in state["queries"]},
     }
 
 
