@@ -82,7 +82,8 @@ class LateMasks:
         return self._take(last=True)
 
     def _take(self, last: bool) -> list[LateMask]:
-        out, left = [], []
+        out: list[LateMask] = []
+        left: list[_Waiting] = []
         for mask in self._waiting:
             sight = self._views.get(mask.key)
             mask.turns += 1
