@@ -1,5 +1,6 @@
 """The mesh for viewers: what arrives, that nobody waits, and bytes that are no mesh."""
 
+import os
 import socket
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from artemis_edge.service.map_feed import MapFeed, MapReader, from_bytes, to_bytes
-from tests.test_tui import delta
+from tests.fake_remote import delta
 
 
 def test_a_delta_comes_back() -> None:
@@ -92,3 +93,24 @@ def test_strangers_are_let_go(tmp_path: Path) -> None:
     assert reader._socket is None
     connection.close()
     listener.close()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becomes another user")
+def test_only_its_owner_may_watch(tmp_path: Path) -> None:
+    for folder in (tmp_path, *tmp_path.parents[:2]):
+        folder.chmod(0o755)  # what keeps strangers out is to be the socket's mode
+    feed = MapFeed(tmp_path / "map.sock", 0o660)
+    pid = os.fork()
+    if pid == 0:
+        os.setgroups([])
+        os.setgid(65534)
+        os.setuid(65534)
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stranger:
+                stranger.connect(str(feed.path))
+        except PermissionError:
+            os._exit(7)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 7
+    assert feed.turn() is False
+    feed.close()

@@ -31,6 +31,7 @@ from artemis_edge.session.verify import verify
 from artemis_edge.session.wire_replay import WireRig, read
 from tests import networks, small_session
 from tests.control_client import ask
+from tests.listening import listening
 from tests.livox_ports import reserved
 from tests.waiting import until
 
@@ -110,6 +111,7 @@ def played(
             assert until(service.listens, _PATIENCE_S, 0.2), _log(service)
             assert until(lambda: _mapped(service) > 3, _PATIENCE_S, 0.2), _log(service)
             seen["status"] = ask(service.path, do="status")["result"]
+            seen["listening"] = listening(service.process.pid)
             ask(service.path, do="mark", text="here")
             seen["asked"] = [
                 ask(service.path, do="ask", text=text) for text in ("car", "green person", "giraffe", "")
@@ -133,6 +135,14 @@ def played(
             yield session, service, seen
         finally:
             service.end()
+
+
+def test_nothing_listens_on_the_network(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+    """Datagrams of the devices come in; but nobody can connect."""
+    _, _, seen = played
+    assert seen["listening"] == []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        assert len(listening(os.getpid())) >= 1, server
 
 
 def _mapped(service: _Service) -> int:

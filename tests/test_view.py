@@ -1,10 +1,12 @@
 """The feed to a viewer, the growing mesh it makes, the gate and the colours; the browser itself: tests/viewer."""
 
+import os
 import socket
 import time
 import urllib.error
 import urllib.request
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -16,10 +18,12 @@ from artemis_edge.frames import MeshDelta
 from artemis_edge.service.map_feed import MapReader
 from artemis_edge.status import QueryStatus
 from artemis_edge.telling import telling
+from artemis_edge.view import browser
 from artemis_edge.view.gate import Gate, answer
 from artemis_edge.view.kinds import KINDS, coloured
 from artemis_edge.view.live import lighted, map_socket, sentence
 from artemis_edge.view.live_mesh import LiveMesh, Patch, patches, region_of
+from tests.listening import listening
 from tests.textured import square_room
 
 
@@ -121,6 +125,27 @@ def test_sockets_that_are_none_are_told(tmp_path: Path) -> None:
         pass
     with telling(ViewConfig()) as live:
         live.watching(None)(delta_of(BLOCKS))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("host", "wide"), [("127.0.0.1", False), ("localhost", False), ("127.0.0.2", True)])
+def test_the_server_itself_is_never_open_to_others(
+    host: str, wide: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other machines reach a gate that asks for a token; what is behind it listens on this one."""
+    viser = MagicMock()
+    viser.ViserServer.return_value.get_port.return_value = 9
+    monkeypatch.setattr(browser, "_viser", lambda: viser)
+    shown = browser.Browser(host, 0, lambda kind: None)
+    try:
+        assert viser.ViserServer.call_args.kwargs["host"] == "127.0.0.1"
+        assert (
+            (f"http://{host}:" in shown.url and "token=" in shown.url) if wide else "token" not in shown.url
+        )
+        mine = listening(os.getpid())
+        assert sum(address.startswith("0200007F") for address in mine) == wide
+        assert not any(address.startswith("00000000:") for address in mine)
+    finally:
+        shown.close()
 
 
 def test_regions_join_blocks_by_the_names_of_vertices() -> None:

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
-from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 from types import FrameType
@@ -22,7 +21,6 @@ from typing import Any
 
 import msgspec
 from artemis_drivers.base import DriverError, State
-from artemis_drivers.trigger.messages import Opcode
 from artemis_drivers.udp import Interface, interfaces
 
 from artemis_edge import health, topics
@@ -30,6 +28,7 @@ from artemis_edge.errors import InputError, RunError
 from artemis_edge.segmentation.registry import Registry
 from artemis_edge.service.capture import Capture
 from artemis_edge.service.control import ControlSocket, control_path
+from artemis_edge.service.lights import Lights, Phase
 from artemis_edge.service.live_session import LiveSession, session_folder
 from artemis_edge.service.notify import Notifier
 from artemis_edge.service.outlet import Outlet
@@ -52,21 +51,6 @@ _DRAIN_S = 12.0
 _MARK_LONGEST = 500
 _BUTTON_RECORD, _BUTTON_MARK = 0, 1
 _NS = 1e9
-
-
-class Phase(StrEnum):
-    """What the service does."""
-
-    IDLE = "idle"
-    CHECKING = "checking"
-    RECORDING = "recording"
-    SAVING = "saving"
-    FAULT = "fault"
-
-
-# Patterns of the board's LED and buzzer (firmware_cfg/trigger): 0 is off.
-_LED = {Phase.IDLE: 1, Phase.CHECKING: 2, Phase.RECORDING: 3, Phase.SAVING: 4, Phase.FAULT: 5}
-_BUZZER = {Phase.RECORDING: 1, Phase.SAVING: 2, Phase.FAULT: 3}
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +101,7 @@ class Daemon:
             raise InputError(str(error)) from None
         self.outlet = Outlet(MessageRing.create(config.service.ring_mb, _next_number(self.wanted.go_on)))
         self.capture = Capture(self.rig, self.outlet)
+        self._lights = Lights(self.rig.board)
         self._view = StatusView(config)
         self.desk = make_desk(config)
         for text in self.wanted.queries:
@@ -174,6 +159,7 @@ class Daemon:
                 self._end_session()
             if self.session.over:
                 self._close_session(self.session)
+        self._lights.turn()
         self._view.look(self.capture.health())
         self._notify.status(self._sentence())
         if self._alive():
@@ -183,9 +169,11 @@ class Daemon:
         """SIGTERM: devices first, then what is on its way, then the files; bounded, a second signal hurries."""
         self._notify.stopping()
         asked = self._signals
+        session = self.session
+        if session is not None:
+            self._lights.show(Phase.SAVING)
         self.rig.stop()
         self.capture.stop()
-        session = self.session
         if session is not None:
             self._end_session()
         drained = time.monotonic() + _DRAIN_S
@@ -198,6 +186,8 @@ class Daemon:
                     self.session.hurry()
             if session is not None and session.recorder is not None and time.monotonic() > drained:
                 session.recorder.process.kill()
+        self._lights.off()
+        self.rig.stop_board()
         short = any(ended["fault"] for ended in self._ended_sessions)
         return 1 if short or self.fault else 0
 
@@ -276,16 +266,22 @@ class Daemon:
             if button == _BUTTON_RECORD:
                 if self.phase == Phase.RECORDING:
                     self._end_session()
+                elif self.phase == Phase.CHECKING:
+                    self._become(Phase.IDLE)
                 elif self.phase == Phase.IDLE:
                     self._begin_checking(None)
-            elif button == _BUTTON_MARK:
+            elif button == _BUTTON_MARK and self.phase == Phase.RECORDING:
                 self._mark("button")
+            elif button == _BUTTON_MARK:
+                message = f"a mark belongs to a recording: the service is {self.phase}"
+                self._tell({"kind": "warning", "message": message})
 
     def _mark(self, text: str) -> int:
         self._marks.count += 1
         event = {"kind": "mark", "number": self._marks.count, "text": text[:_MARK_LONGEST]}
         self.outlet.say(topics.EVENTS.name, event)
         self._tell(event, recorded=True)
+        self._lights.marked()
         return self._marks.count
 
     # --- what is told ---
@@ -296,8 +292,7 @@ class Daemon:
         self.phase = phase
         self._known = None
         self._tell({"kind": "state", "state": str(phase)})
-        if self.rig.board is not None:
-            self.rig.board.command(Opcode.INDICATE, _LED[phase], _BUZZER.get(phase, 0))
+        self._lights.show(phase)
 
     def _fail(self, why: str) -> None:
         self.fault = why

@@ -149,6 +149,7 @@ class LiveSession:
         until = self.ended_s or time.monotonic()
         return {
             "folder": str(self.folder),
+            "report": str(report) if self.over and (report := self._out / "report.html").exists() else "",
             "seconds": round(until - self.begun_s, 1),
             "recorder": self.recorder.latest if self.recorder is not None else self.recorder_last,
             "recorder_restarts": self.recorder_restarts,

@@ -56,10 +56,15 @@ class Rig:
             raise
 
     def stop(self) -> None:
-        """LiDAR, trigger board, cameras, IMU: first what costs most when it is cut off."""
-        for part in (self.livox, self.board, *self.cameras, self.imu):
+        """LiDAR, cameras, IMU: first what costs most when it is cut off. The board still shows what is going on."""
+        for part in (self.livox, *self.cameras, self.imu):
             if part is not None:
                 part.stop()
+
+    def stop_board(self) -> None:
+        """After its lights are out."""
+        if self.board is not None:
+            self.board.stop()
 
     def health(self) -> list[Health]:
         """Every device."""

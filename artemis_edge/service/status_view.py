@@ -67,6 +67,7 @@ class StatusView:
             segmentation_hz=float((session.get("segmentation") or {}).get("hz", 0.0)),
             position=(pose[3], pose[7], pose[11]),
             yaw=math.atan2(pose[4], pose[0]),
+            report=next((e["report"] for e in reversed(state["ended"]) if e.get("report")), ""),
         )
 
     def _stream(self, health: Health) -> Stream:

@@ -106,7 +106,8 @@ class LivePage(Screen[None]):
         queries = [found_in(self._copy, q) for q in status.queries]
         if status.state in ("done", "idle"):  # nobody is looking any more
             queries = [replace(q, status="not found") if q.status == "searching" else q for q in queries]
-        status = replace(status, queries=queries)
+        known = status.map if status.map.vertices else replace(status.map, vertices=len(self._copy))
+        status = replace(status, queries=queries, map=known)
         self._status = status
         self.query_one(Gauges).show(status)
         self.query_one(FrameTimes).show(status)

@@ -68,17 +68,25 @@ class TriggerBoard(DeviceThread):
         self._triggers, self._pulses = EventCounter(), EventCounter()
         self._bus: Bus | None = None
         self._outbox: deque[Record] = deque()
+        self._led = 0
         self._heard_s = 0.0
         self._health: BoardHealth | None = None
         self._fault: Emcy | None = None
         self._counts = {"unplugged": 0, "silent": 0, "bad_frames": 0, "other_frames": 0, "board_restarts": 0}
         self._counts |= {"overruns": 0, "unsent": 0}
 
-    def command(self, opcode: Opcode, led: int = 0, buzzer: int = 0) -> None:
-        """Arm, run or stop the triggers, or only indicate: patterns 0..15 for LED and buzzer."""
+    def command(self, opcode: Opcode, led: int | None = None, buzzer: int = 0) -> None:
+        """Arm, run or stop the triggers, or only indicate: patterns 0..15 for LED (None: as before) and buzzer."""
         s = self.settings
-        phase = s.phase_us
-        self._outbox.append(Command(opcode, s.rate_hz, s.pulse_us, phase, led & 0xF | (buzzer & 0xF) << 4))
+        self._led = self._led if led is None else led & 0xF
+        lights = self._led | (buzzer & 0xF) << 4
+        self._outbox.append(Command(opcode, s.rate_hz, s.pulse_us, s.phase_us, lights))
+
+    @property
+    def led_shown(self) -> int | None:
+        """The LED's pattern as the board tells it, None while it does not run."""
+        running = self._state == State.RUNNING and self._health is not None
+        return self._health.led_state if running and self._health is not None else None
 
     def reset(self) -> None:
         """Boot the board anew."""
