@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import socket
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -36,13 +37,17 @@ from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.odometry.local_map import LocalMap
 from artemis_edge.paging import read_pages
 from artemis_edge.segmentation.keyframes import read_keyframes
+from artemis_edge.service.mapper import LiveMapper, MapperTask
 from artemis_edge.session import feed
+from artemis_edge.session.line_channel import LineChannel
+from artemis_edge.session.message_ring import MessageRing
 from artemis_edge.session.stream_mapping import StreamMapping
 from artemis_edge.session.stream_search import StreamSearch
 from artemis_edge.session.writer import SessionWriter
 from artemis_edge.trajectory import read_tum
 from tests import box_world
 from tests.conftest import FakeMapper
+from tests.recordings import publish
 
 _FRAMES = 10
 
@@ -54,11 +59,11 @@ def _turned(yaw: float, place: tuple[float, float, float]) -> F64:
     return T
 
 
-def _houses(seed: int, side: float = 40.0) -> np.ndarray:
+def _houses(seed: int, side: float = 30.0) -> np.ndarray:
     """Points float32 on a floor and on walls of houses, as a LiDAR at the height of 0 sees them."""
     rng = np.random.default_rng(seed)
     parts = [np.column_stack([rng.uniform(0, side, (9000, 2)), np.full(9000, -1.5)])]
-    for _ in range(14):
+    for _ in range(10):
         (x, y), size = rng.uniform(0, side, 2), rng.uniform(2, 7, 2)
         yaw = rng.uniform(0, np.pi)
         for a in range(4):
@@ -83,7 +88,7 @@ def _piece(points: np.ndarray, T_map_piece: F64, reach: float = 14.0) -> np.ndar
 def test_a_piece_is_recognised_wherever_it_lies_and_however_it_is_turned() -> None:
     world = _houses(1)
     recognition = Recognition(world[::2])
-    for yaw, x, y in ((2.3, 12.0, 25.0), (-0.7, 28.0, 15.0)):
+    for yaw, x, y in ((2.3, 12.0, 17.0), (-0.7, 20.0, 12.0)):
         T = _turned(yaw, (x, y, 0.3))
         place = recognition.find(_piece(world[1::2], T))
         assert place is not None and place.share > 0.8 and place.other < 0.85 * place.share
@@ -93,7 +98,7 @@ def test_a_piece_is_recognised_wherever_it_lies_and_however_it_is_turned() -> No
 
 def test_what_the_map_does_not_show_is_not_recognised() -> None:
     recognition = Recognition(_houses(1))
-    assert recognition.find(_piece(_houses(2), _turned(0.4, (20.0, 20.0, 0.0)))) is None
+    assert recognition.find(_piece(_houses(2), _turned(0.4, (15.0, 15.0, 0.0)))) is None
     assert recognition.find(np.empty((0, 3), np.float32)) is None
     assert recognition.find(np.full((50, 3), 7, np.float32)) is None
     assert Recognition(np.empty((0, 3), np.float32)).find(_houses(1)) is None
@@ -273,7 +278,7 @@ def test_a_stream_that_is_never_recognised_is_given_up(walks: tuple[Path, Path, 
 
 def test_a_search_waits_until_enough_is_seen() -> None:
     world = _houses(1)
-    search, T = Search(Recognition(world)), _turned(0.5, (20.0, 18.0, 0.0))
+    search, T = Search(Recognition(world)), _turned(0.5, (17.0, 15.0, 0.0))
     empty = TrackedFrame(0, 0, np.eye(4), (DeskewedScan(np.empty((0, 3), np.float32), np.zeros(3)),))
     assert search.add(empty) is None and search.last_look() is None and search.looks == 0
     scan = (DeskewedScan(_piece(world, T), np.zeros(3)),)
@@ -320,3 +325,32 @@ def test_points_and_photographs_of_the_earlier_map_stay(tmp_path: Path) -> None:
     assert all((folders[1] / entry["file"]).read_bytes() == png for entry in index)
     keyframes = read_keyframes(folders[1])
     assert sorted(float(k.T_world_cam[0, 3]) for k in keyframes) == [0.0, 5.0]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_live_mapping_looks_first_and_then_maps_from_its_first_message(
+    walks: tuple[Path, Path, Path], tmp_path: Path, fake_pipeline: list[FakeMapper], known: bool
+) -> None:
+    session, pages = tmp_path / "session", tmp_path / "pages"
+    shutil.copytree(walks[0], session / "result")
+    pages.mkdir()
+    ring = MessageRing.create(64.0)
+    for sent in feed.messages(walks[1]):
+        publish(ring, sent)
+    here, there = (LineChannel(end) for end in socket.socketpair())
+    mapper = LiveMapper(
+        MapperTask(str(session), str(tmp_path / "out"), earlier=str(session)), ring, here, pages
+    )
+    assert any("looking for the place" in sentence for sentence in mapper.status()["coaching"])
+    if not known:
+        mapper._search = StreamSearch(Config(), EarlierMap(walks[0], _houses(5)))
+    there.say({"do": "stop", "at": ring.published})
+    mapper._loop()
+    assert (
+        len(fake_pipeline[-1].trajectory) == _FRAMES
+        and (mapper.mapping.statistics.continued is not None) == known
+    )
+    assert any("mapped on its own" in sentence for sentence in mapper.status()["coaching"]) != known
+    assert bool(fake_pipeline[-1].earlier) == known
+    there.socket.close()
+    here.socket.close()

@@ -24,7 +24,8 @@ _DIRECTIONS = 6  # of walls, 30 degrees each
 _BOTH = 1.0 / 3.0  # of a direction's width: a wall this near to the next counts there, too
 _BESIDE = 0.5  # of a facet in the next cell
 _FLOORS = 0.25  # weight of floors and ceilings, which are everywhere
-_REACH_M = 25.0  # facets of a piece farther from its middle would need more headings
+_REACH_M = 20.0  # facets of a piece farther from its middle would need more headings
+_REACH_UP_M = 6.0
 _PEAKS = 6  # of a heading
 
 Spectrum = NDArray[np.complex64]
@@ -42,7 +43,7 @@ class Correlator:
 
     def __init__(self, known: Facets) -> None:
         low, high = known.centre.min(axis=0), known.centre.max(axis=0)
-        around = np.array([2 * _REACH_M, 2 * _REACH_M, _REACH_M])
+        around = 2.0 * np.array([_REACH_M, _REACH_M, _REACH_UP_M])
         self.cell_m = max(_LEAST_CELL_M, (float(np.prod(high - low + around)) / _MOST_CELLS) ** (1 / 3))
         self._origin = low
         padded = np.ceil((high - low + around) / self.cell_m).astype(np.int64) + 2
@@ -56,7 +57,7 @@ class Correlator:
             return []
         middle = np.median(piece.centre, axis=0)
         flat = np.linalg.norm((piece.centre - middle)[:, :2], axis=1) < _REACH_M
-        low = np.abs(piece.centre - middle)[:, 2] < 0.5 * _REACH_M
+        low = np.abs(piece.centre - middle)[:, 2] < _REACH_UP_M
         near = Facets(piece.centre[flat & low] - middle, piece.normal[flat & low])
         headings = 2 * int(np.ceil(np.pi * _REACH_M / self.cell_m / 2))
         found: list[tuple[float, int, F64]] = []
