@@ -29,7 +29,7 @@ from artemis_edge.keeper import Keeper
 from artemis_edge.kept_points import open_points
 from artemis_edge.loop.correlation import Correlator
 from artemis_edge.loop.facets import Facets, facets_of
-from artemis_edge.loop.recognition import Recognition
+from artemis_edge.loop.recognition import Place, Recognition
 from artemis_edge.loop.relocate import Search
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.known_map import KnownMap, Start
@@ -91,9 +91,16 @@ def test_a_piece_is_recognised_wherever_it_lies_and_however_it_is_turned() -> No
     for yaw, x, y in ((2.3, 12.0, 17.0), (-0.7, 20.0, 12.0)):
         T = _turned(yaw, (x, y, 0.3))
         place = recognition.find(_piece(world[1::2], T))
-        assert place is not None and place.share > 0.8 and place.other < 0.85 * place.share
+        assert place is not None and place.share > 0.8 and place.clear and place.other < place.share
         off = se3.log(se3.inverse(T) @ place.T_map_piece)
         assert np.linalg.norm(off[:3]) < 0.03 and np.linalg.norm(off[3:]) < 0.005
+
+
+def test_another_place_must_explain_fewer_walls_than_chance_allows() -> None:
+    T = np.eye(4)
+    assert Place(T, 0.99, 200, 0.85).clear and not Place(T, 0.99, 40, 0.85).clear
+    assert not Place(T, 0.66, 300, 0.5).clear and Place(T, 0.7, 300, 0.3).clear
+    assert not Place(T, 0.9, 0, 0.0).clear and not Place(T, 0.99, 500, 0.97).clear
 
 
 def test_what_the_map_does_not_show_is_not_recognised() -> None:

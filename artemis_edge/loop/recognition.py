@@ -34,16 +34,23 @@ _LEAST_FACETS = 30  # walls, of a piece that can be recognised
 # Of the walls seen, those that must be the map's: walls of another place agree by chance in up to 0.55 of them
 _LEAST_SHARE = 0.65
 _LEAST_SPREAD = 0.05  # smaller eigenvalue of the mean of n n' over those walls, level
-_CLEAR = 0.85  # of the best place's share, below which every other place must lie
+_CLEAR = 4.0  # deviations of a count, by which no other place may come as near to explaining the walls
 _APART_M, _APART_RAD = 1.0, 0.2  # places farther apart are others
 
 
 class Place(NamedTuple):
-    """T_map_piece (4, 4); ``share`` of the walls seen that the map has there, and of the next best place."""
+    """T_map_piece (4, 4); ``share`` of the ``walls`` seen that the map has there, and of the next best place."""
 
     T_map_piece: F64
     share: float
-    other: float
+    walls: int
+    other: float = 0.0
+
+    @property
+    def clear(self) -> bool:
+        """Are walls that only this place explains too many for chance? What neither explains counts as its noise."""
+        noise = (self.walls * (2.0 - self.share - self.other)) ** 0.5
+        return self.walls * (self.share - self.other) > _CLEAR * noise
 
 
 class Recognition:
@@ -62,21 +69,22 @@ class Recognition:
         places = self.places(points)
         if not places:
             return None
-        best, other = places[0], max((p.share for p in places[1:] if _other(places[0], p)), default=0.0)
-        clear = best.share >= _LEAST_SHARE and other < _CLEAR * best.share
-        return best._replace(other=other) if clear else None
+        other = max((p.share for p in places[1:] if _other(places[0], p)), default=0.0)
+        best = places[0]._replace(other=other)
+        return best if best.share >= _LEAST_SHARE and best.clear else None
 
     def places(self, points: F32) -> list[Place]:
         """All places that were looked at, the best first, whatever they are worth."""
         piece = facets_of(points)
-        if self._correlator is None or np.count_nonzero(piece.upright()) < _LEAST_FACETS:
+        walls = int(np.count_nonzero(piece.upright()))
+        if self._correlator is None or walls < _LEAST_FACETS:
             return []
         scan = TimedPoints(points, np.zeros(len(points), np.float32))
         scan = scan.take(np.arange(0, len(points), max(len(points) // _POINTS, 1)))
         found = []
         for guess in self._correlator.guesses(piece, _GUESSES):
             T = self._registered(scan, guess.T_map_piece, self._correlator.cell_m)
-            found.append(Place(T, self._share(piece.moved(T)), 0.0))
+            found.append(Place(T, self._share(piece.moved(T)), walls))
         return sorted(found, key=lambda place: -place.share)
 
     def _registered(self, scan: TimedPoints, guess: F64, cell_m: float) -> F64:
