@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -25,8 +26,11 @@ def silent(done: int, total: int, note: str = "") -> None:
 
 
 def say(sentence: str) -> None:
-    """One plain line on stderr."""
-    print(sentence, file=sys.stderr, flush=True)
+    """One plain line on stderr; where nobody reads it any more (``| tee``, stopped), the work goes on."""
+    try:
+        print(sentence, file=sys.stderr, flush=True)
+    except BrokenPipeError:  # nor may Python try to flush it at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 @contextmanager

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from artemis_drivers.udp import Interface, interfaces
 
 from artemis_edge import health, topics
 from artemis_edge.errors import InputError, RunError
+from artemis_edge.progress import say
 from artemis_edge.segmentation.registry import Registry
 from artemis_edge.service.capture import Capture
 from artemis_edge.service.control import ControlSocket, control_path
@@ -79,7 +79,7 @@ class Daemon:
         config: RunConfig,
         wanted: Wanted | None = None,
         own_addresses: Callable[[], list[Interface]] = interfaces,
-        log: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
+        log: Callable[[str], None] = say,
     ) -> None:
         self.config, self.wanted = config, wanted or Wanted()
         self.phase = Phase.IDLE
