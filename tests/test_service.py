@@ -35,7 +35,7 @@ from tests.listening import listening
 from tests.livox_ports import reserved
 from tests.waiting import until
 
-_PATIENCE_S = 90.0
+_PATIENCE_S = 300.0
 _PICTURES = topics.CAMERA_IMAGE.name
 
 

@@ -200,6 +200,8 @@ class LiveMapper:
             "missed": feed.missed,
             "pose": [round(float(v), 4) for v in pose[:3].ravel()],
             "lost": {**statistics.lost, **self.mapping.assembler.lost, **masks.lost},
+            "vertices": self.mapping.size.vertices,
+            "triangles": self.mapping.size.triangles,
             "masks": masks.fused,
             "behind_s": round(feed.behind_s(), 2),
             "load": self.mapping.load.level,

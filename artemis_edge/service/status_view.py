@@ -11,7 +11,7 @@ import msgspec
 from artemis_drivers.base import Health, State
 
 from artemis_edge.service.settings import RunConfig, device_name
-from artemis_edge.status import QueryStatus, Status, Stream, SyncStatus
+from artemis_edge.status import MapStatus, QueryStatus, Status, Stream, SyncStatus
 from artemis_edge.status import State as Phase
 
 _COUNTED = ("points_packets", "samples", "frames", "events")
@@ -65,6 +65,11 @@ class StatusView:
             losses={**state["lost"], **mapping.get("lost", {})},
             queries=msgspec.convert(state["queries"], list[QueryStatus]),
             segmentation_hz=float((session.get("segmentation") or {}).get("hz", 0.0)),
+            map=MapStatus(
+                vertices=mapping.get("vertices", 0),
+                triangles=mapping.get("triangles", 0),
+                resident_mb=mapping.get("rss_mb", 0.0),
+            ),
             position=(pose[3], pose[7], pose[11]),
             yaw=math.atan2(pose[4], pose[0]),
             report=next((e["report"] for e in reversed(state["ended"]) if e.get("report")), ""),

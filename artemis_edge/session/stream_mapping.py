@@ -24,6 +24,7 @@ from artemis_edge.frames import MeshDelta, SyncedFrame, Trajectory
 from artemis_edge.highlight import Reply, answer, objects_of
 from artemis_edge.keeper import Keeper
 from artemis_edge.loop.relocate import Found
+from artemis_edge.map_size import MapSize
 from artemis_edge.mapping_run import Mapper
 from artemis_edge.runtime import MakeMapper, pipeline, with_tiny_map, write_results
 from artemis_edge.segmentation import attribute
@@ -88,6 +89,7 @@ class StreamMapping:
         self.latest_ns = 0
         self.fault = ""
         self.delta: MeshDelta | None = None  # of the latest frame
+        self.size = MapSize()
         self.before: Callable[[int], None] = lambda index: None
 
     def go_on_in(self, earlier: EarlierMap, found: Found, first_ns: int) -> None:
@@ -194,6 +196,7 @@ class StreamMapping:
         frame = self._prepare(thinned(frame, self.load.every_point))
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
         self.delta = self.mapper.process(frame)
+        self.size.add(self.delta)
         wall, cpu = time.perf_counter_ns() - wall, time.process_time_ns() - cpu
         self.statistics.add_frame(wall / _NS_PER_MS, cpu / _NS_PER_MS, self.mapper.stage_ms)
         self.statistics.add_lost(frame.lost)

@@ -314,7 +314,8 @@ def play(session: Path, folder: Path, lead_s: float = _LEAD_S, patience_s: float
     """Play a session to whoever connects; returns an exit code. Raises UserError."""
     with WireRig(read(session), folder) as rig:
         say(
-            f"virtual devices are ready; in another terminal: artemis-edge run --config {folder / 'rig.toml'}"
+            f"virtual devices are ready; in other terminals: artemis-edge run --config {folder / 'rig.toml'}, and "
+            f"artemis-edge tui --socket {folder / 'control'}"
         )
         end = time.monotonic() + patience_s
         while not rig.connected:

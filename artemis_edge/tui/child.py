@@ -21,6 +21,7 @@ from msgspec.structs import replace
 from artemis_edge import health
 from artemis_edge.config import Config
 from artemis_edge.frames import MeshDelta, Odometry, SyncedFrame
+from artemis_edge.map_size import MapSize
 from artemis_edge.newest import Newest
 from artemis_edge.pipeline import Pipeline
 from artemis_edge.progress import Report
@@ -204,6 +205,7 @@ class WatchedPipeline(Pipeline):
         self._teller = teller
         self._due = 0.0
         self._frames = 0
+        self._size = MapSize()
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
         """One frame, not before its time."""
@@ -214,6 +216,7 @@ class WatchedPipeline(Pipeline):
         start = time.perf_counter()
         delta = super().process(frame)
         self._frames += 1
+        self._size.add(delta)
         self._teller.frame(delta, (time.perf_counter() - start) * 1e3)
         self._tell(frame)
         return delta
@@ -228,7 +231,6 @@ class WatchedPipeline(Pipeline):
     def _tell(self, frame: SyncedFrame) -> None:
         T = self.trajectory[-1][1]
         points = sum(len(scan.points) for scan in frame.scans)
-        counter = self.voxel_map.store.counter
         streams = [
             Stream("lidar", points / _FRAME_S, 0.0, frame.lost.get("packets", 0), state="running"),
             Stream("camera", len(frame.images) / _FRAME_S, 10.0, state="running"),
@@ -240,9 +242,7 @@ class WatchedPipeline(Pipeline):
             streams=streams,
             position=tuple(float(v) for v in T[:3, 3]),
             yaw=float(np.arctan2(T[1, 0], T[0, 0])),
-            map=MapStatus(
-                vertices=int(counter[2]), triangles=int(counter[3]), resident_mb=health.resident_mb()
-            ),
+            map=MapStatus(self._size.vertices, self._size.triangles, resident_mb=health.resident_mb()),
             message="",
             degenerate=self.tracked is not None and self.tracked.degenerate,
             coaching=[said] if (said := getattr(self.odometry, "instruction", None)) is not None else [],

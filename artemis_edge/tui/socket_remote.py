@@ -108,7 +108,7 @@ class SocketRemote:
 
 def _sentence(path: Path, error: OSError | ValueError) -> str:
     if isinstance(error, FileNotFoundError | ConnectionRefusedError):
-        return f"no service listens at {path}; start it with: artemis-edge run"
+        return f"no service listens at {path}; start it with: artemis-edge run, or name its socket: tui --socket PATH"
     if isinstance(error, PermissionError):
         return f"you may not use {path}; join the service's group, or ask its administrator"
     if isinstance(error, TimeoutError):
