@@ -4,6 +4,9 @@ Frame k of a camera belongs to trigger k + anchor. The camera's own clock need n
 only has to agree that the time between two frames is the time between their triggers, to a quarter of a
 period. Where it does not (an exposure was missed, and the camera did not count it), the neighbouring triggers
 are tried; a frame that fits none is dropped and counted, never guessed.
+
+A board that is not heard for a while (its cable is out) goes on with its triggers: a frame whose trigger is overdue
+belongs to the one that the rate foretells, where the camera's interval confirms it.
 """
 
 from __future__ import annotations
@@ -13,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 _HISTORY = 1200  # triggers: two minutes at 10 Hz
-_BRIDGE = 5  # triggers in a row whose messages may be missing
 _REACH = 50  # triggers searched on either side after a mismatch
 _STRAY_FRAMES = 5  # frames in a row that fit no trigger: the anchor is wrong
 _PENDING = 100  # frames that may wait for their trigger
@@ -22,6 +24,8 @@ _REORDERED = 4  # numbers that a late frame may be behind
 _AGREEING = 3  # frames whose arrival must name the same anchor
 _SKEW = 400e-6  # most that two quartz clocks differ, with a margin
 _PATIENCE_NS = 1_000_000_000
+_OVERDUE_NS = 100_000_000  # the message of a trigger takes some ms, on a bad USB stick some ten
+_UNHEARD = 600  # triggers in a row that may not be told: the rate of _REACH, of edges to 1 us, is then good for 25 us
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +46,7 @@ class FrameStamp:
 @dataclass(frozen=True, slots=True)
 class Pair:
     """A frame with its trigger; times of the board in ns. ``interpolated``: the trigger's own message was
-    lost and its edge lies between its neighbours; ``measured``: delay and exposure come from a strobe.
+    lost and its edge follows from its neighbours; ``measured``: delay and exposure come from a strobe.
     """
 
     frame: FrameStamp
@@ -58,7 +62,7 @@ class CameraTiming:
     """Calibration of a camera: ``delay_ns`` from trigger edge to start of exposure; ``index`` of its strobe.
 
     ``latency_ns``, the least time from the end of exposure to arrival at the host, lets a camera that starts
-    or restarts while triggers run be anchored; without it, that needs ``arm``.
+    while triggers run be anchored; without it, that needs ``arm``, and what was seen then serves for a restart.
     """
 
     delay_ns: int = 0
@@ -111,11 +115,9 @@ class TriggerHistory:
         return self._edges[before] + elapsed * (count - before) // steps, True
 
     def _known(self, count: int, direction: int) -> int | None:
-        """The nearest trigger that was told, up to a few away."""
-        for step in range(1, _BRIDGE + 1):
-            if (near := count + direction * step) in self._edges:
-                return near
-        return None
+        """The nearest trigger that was told."""
+        most = _UNHEARD if direction < 0 else min(_UNHEARD, self.latest - count)
+        return next((n for k in range(1, most + 1) if (n := count + direction * k) in self._edges), None)
 
     def period_ns(self) -> int | None:
         """Time between the latest neighbouring triggers."""
@@ -131,6 +133,25 @@ class TriggerHistory:
         if period is None or after is None:
             return None
         return self._edges[after] - (after - count) * period
+
+    def foretold(self, count: int) -> int | None:
+        """Board time of a trigger after the latest one that was told, if the board goes on at its rate."""
+        period = self.period_ns()
+        if period is None or not 0 < count - self.latest <= _UNHEARD:
+            return None
+        near = range(self.latest - _REACH, self.latest)
+        first = next((c for c in near if self._in_step(c, period)), None)
+        if first is None:
+            return None  # the rate has just changed
+        latest, elapsed = self._edges[self.latest], self._edges[self.latest] - self._edges[first]
+        return latest + elapsed * (count - self.latest) // (self.latest - first)
+
+    def _in_step(self, count: int, period: int) -> bool:
+        """Whether the triggers from one that was told to the latest came at one rate."""
+        edge = self._edges.get(count)
+        if edge is None:
+            return False
+        return abs(self._edges[self.latest] - edge - (self.latest - count) * period) <= period // 100
 
     def nearest(self, board_ns: int) -> int | None:
         """Count of the trigger nearest to a time, by the latest one and the period; None if unknown."""
@@ -167,11 +188,12 @@ class FramePairing:
     _armed: int | None = None
     _last: _Last | None = None
     _stray: int = 0
+    _least_ns: int | None = None  # from the end of exposure to arrival, as seen
 
     def arm(self, count: int, sequence: int) -> None:
         """Frame ``sequence`` will belong to trigger ``count``: both stood still when this was said."""
         self.unanchor()
-        self._armed = count - sequence
+        self._armed, self._least_ns = count - sequence, None
 
     def unanchor(self) -> None:
         """The counts of triggers or frames began anew."""
@@ -227,7 +249,7 @@ class FramePairing:
         pairs = []
         while self._pending and self.anchor is not None:
             frame = self._pending[0]
-            outcome = self._match(frame)
+            outcome = self._match(frame, overdue=now_ns - frame.rx_ns > _OVERDUE_NS)
             if outcome is None and now_ns - frame.rx_ns <= _PATIENCE_NS and len(self._pending) < _PENDING:
                 break
             self._pending.popleft()
@@ -238,23 +260,30 @@ class FramePairing:
                 self.counts[outcome or "unpaired_no_trigger"] += 1
         return pairs
 
-    def _match(self, frame: FrameStamp) -> Pair | str | None:
+    def _match(self, frame: FrameStamp, *, overdue: bool) -> Pair | str | None:
         """The frame's pair; or why there is none; or None while its trigger may still arrive."""
         assert self.anchor is not None
         count = frame.sequence + self.anchor
-        slip = self._slip(frame, count)
-        if slip is None:
+        edge = self._edge(count, overdue=overdue)
+        slip = self._slip(frame, edge)
+        if slip is None or edge is None:
             return None if count >= self.history.latest else self._give_up(frame, count)
         if slip == 0:
-            return self._accept(frame, count)
+            return self._accept(frame, count, edge)
         count += slip
-        if abs(slip) > _REACH or self._slip(frame, count) != 0:
-            if abs(slip) <= _REACH and count > self.history.latest:
-                return None
-            return self._reject()
+        edge = self._edge(count, overdue=overdue) if abs(slip) <= _REACH else None
+        if edge is None or self._slip(frame, edge) != 0:
+            return None if abs(slip) <= _REACH and count > self.history.latest else self._reject()
         self.anchor += slip
         self.counts["reanchored"] += 1
-        return self._accept(frame, count)
+        return self._accept(frame, count, edge)
+
+    def _edge(self, count: int, *, overdue: bool) -> tuple[int, bool] | None:
+        """Board time of a trigger, and whether it follows from others; None if it is not known."""
+        known = self.history.edge(count)
+        if known is None and overdue and (foretold := self.history.foretold(count)) is not None:
+            return foretold, True
+        return known
 
     def _give_up(self, frame: FrameStamp, count: int) -> str:
         """Its trigger was never told. The interval from it still tells whether the next frame slipped."""
@@ -263,12 +292,12 @@ class FramePairing:
             self._last = _Last(count, edge, frame.start_ns)
         return "unpaired_no_trigger"
 
-    def _slip(self, frame: FrameStamp, count: int) -> int | None:
-        """By how many triggers the interval since the last pair says that ``count`` is wrong; None: unknown.
+    def _slip(self, frame: FrameStamp, edge: tuple[int, bool] | None) -> int | None:
+        """By how many triggers the interval since the last pair says that ``edge`` is wrong; None: unknown.
 
         0 also where there is nothing to compare with.
         """
-        edge, period = self.history.edge(count), self.history.period_ns()
+        period = self.history.period_ns()
         if edge is None or period is None:
             return None
         if self._last is None:
@@ -280,16 +309,15 @@ class FramePairing:
             return 0
         return round(difference / period) or (1 if difference > 0 else -1)
 
-    def _accept(self, frame: FrameStamp, count: int) -> Pair | str:
-        found = self.history.edge(count)
-        assert found is not None
-        edge_ns, interpolated = found
+    def _accept(self, frame: FrameStamp, count: int, edge: tuple[int, bool]) -> Pair | str:
+        edge_ns, interpolated = edge
         if self._contradicted(frame, edge_ns):
             return self._reject()
         self._stray = 0
         self._last = _Last(count, edge_ns, frame.start_ns)
         strobe = self.history.strobe(count, self.timing.index)
         delay, exposure = strobe or (self.timing.delay_ns, frame.exposure_ns)
+        self._learn_latency(frame, edge_ns)
         mid_ns = edge_ns + delay + exposure // 2
         return Pair(frame, count, edge_ns, mid_ns, interpolated, strobe is not None)
 
@@ -299,6 +327,13 @@ class FramePairing:
         if arrival is None or period is None:
             return False
         return not -period // 4 <= arrival - edge_ns <= frame.exposure_ns + _PATIENCE_NS
+
+    def _learn_latency(self, frame: FrameStamp, edge_ns: int) -> None:
+        """For a camera whose latency is not known: it tells the trigger when the camera begins anew."""
+        arrival = self.board_of_host(frame.rx_ns)
+        if arrival is not None:
+            least = arrival - edge_ns - self.timing.delay_ns - frame.exposure_ns
+            self._least_ns = least if self._least_ns is None else min(least, self._least_ns)
 
     def _reject(self) -> str:
         self._stray += 1
@@ -330,11 +365,10 @@ class FramePairing:
         return False
 
     def _vote(self, frame: FrameStamp) -> int | None:
-        if self.timing.latency_ns is None:
-            return None
+        latency = self._least_ns if self.timing.latency_ns is None else self.timing.latency_ns
         arrival = self.board_of_host(frame.rx_ns)
-        if arrival is None:
+        if latency is None or arrival is None:
             return None
-        start = arrival - self.timing.latency_ns - frame.exposure_ns - self.timing.delay_ns
+        start = arrival - latency - frame.exposure_ns - self.timing.delay_ns
         count = self.history.nearest(start)
         return None if count is None else count - frame.sequence

@@ -74,7 +74,7 @@ class PulseClock:
 
     Pulses that the board makes come from the timer that captures: its seconds are session seconds. Pulses
     from outside are measured, and while they are missing the measured rate carries on. ``strange`` pulses
-    came where none should be; ``renumbered``: their number did not fit their time.
+    came where none should be; ``renumbered``: their number did not fit their time. ``model``: board to session time.
     """
 
     def __init__(self, epoch_ns: int) -> None:
@@ -83,12 +83,12 @@ class PulseClock:
         self._pulses: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
         self._strangers: deque[int] = deque(maxlen=_NEW_PHASE)
         self._generated = False
-        self._model: AffineClock | None = None
+        self.model: AffineClock | None = None
         self._least_ns: int | None = None
 
     def add(self, count: int, board_ns: int, *, generated: bool) -> None:
         """Pulse ``count`` at ``board_ns``."""
-        if self._least_ns is not None or self._model is None:
+        if self._least_ns is not None or self.model is None:
             self._begin(count)
         elif not self._expected(count, board_ns):
             return
@@ -98,22 +98,22 @@ class PulseClock:
         self._strangers.clear()
         session = self.epoch_ns + count * SECOND_NS
         self._pulses.append((board_ns, session))
-        self._model = AffineClock(board_ns, session, 0.0 if generated else self._measured())
+        self.model = AffineClock(board_ns, session, 0.0 if generated else self._measured())
 
     def restart(self, least_ns: int | None) -> None:
         """The board began anew: the next pulse is the first whole second not before ``least_ns``."""
         self._least_ns = least_ns
         self._pulses.clear()
-        self._model = None
+        self.model = None
 
     def session_ns(self, board_ns: int) -> int | None:
         """Session time at a board time; None before the first pulse."""
-        return None if self._model is None else self._model.to_y(board_ns)
+        return None if self.model is None else self.model.to_y(board_ns)
 
     @property
     def skew(self) -> float | None:
         """Session seconds a board second, minus one; None before the first pulse."""
-        return None if self._model is None else self._model.skew
+        return None if self.model is None else self.model.skew
 
     def missing_ns(self, board_ns: int) -> int:
         """How long the pulse has been missing; 0 while it comes."""
@@ -124,7 +124,7 @@ class PulseClock:
 
     def report(self, board_ns: int) -> ClockReport:
         """The pulse at board time ``board_ns``."""
-        skew = 0.0 if self._model is None else self._model.skew_ppm
+        skew = 0.0 if self.model is None else self.model.skew_ppm
         missing, pulses = self.missing_ns(board_ns), len(self._pulses)
         doubt = _US_NS + round(0 if self._generated else missing * _HELD_RATE)
         if not pulses:
@@ -148,8 +148,8 @@ class PulseClock:
 
     def _expected(self, count: int, board_ns: int) -> bool:
         """Whether the pulse is at a whole second; its number yields to that."""
-        assert self._model is not None
-        session = self._model.to_y(board_ns)
+        assert self.model is not None
+        session = self.model.to_y(board_ns)
         whole = (session + SECOND_NS // 2) // SECOND_NS * SECOND_NS
         quiet = board_ns - self._pulses[-1][0] if self._pulses else 0
         if abs(session - whole) > _AWAY_NS + abs(quiet) * _QUARTZ:

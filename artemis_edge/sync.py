@@ -18,7 +18,7 @@ from artemis_drivers.trigger.events import Kind
 from artemis_drivers.trigger.messages import PPS_GENERATED
 from numpy.typing import NDArray
 
-from artemis_edge.clock_model import SECOND_NS, EnvelopeFit
+from artemis_edge.clock_model import SECOND_NS, AffineClock, EnvelopeFit
 from artemis_edge.frame_pairing import CameraTiming, FramePairing, FrameStamp, Pair, TriggerHistory
 from artemis_edge.session_clocks import (
     SETTLED_S,
@@ -85,6 +85,9 @@ class Synchroniser:
         self._series: int | None = None
         self._armed = False
         self._triggered = False  # whether a trigger of this boot was told
+        self._carried: tuple[AffineClock, AffineClock] | None = (
+            None  # board to host, board to session: a boot before
+        )
         self.undated: Counter[str] = Counter()
 
     # --- what the devices say ---
@@ -135,14 +138,13 @@ class Synchroniser:
         """Session time of a sample; None while the board is unknown. Never goes back within a boot."""
         imu = self._imus[name]
         host_ns = imu.host_ns(device_ns, boot, rx_ns)
-        board_ns = self._board_of_host(host_ns)
-        session = None if board_ns is None else self.pulse.session_ns(board_ns)
-        if session is None or board_ns is None:
+        session = self.session_of_host(host_ns)
+        if session is None:
             self.undated[name] += 1
             return None
         span = min(self._host.span_s, imu.fit.span_s)
         state = ClockState.LOCKED if span >= SETTLED_S else ClockState.SETTLING
-        if state == ClockState.LOCKED and self.pulse.missing_ns(board_ns):
+        if state == ClockState.LOCKED and self._without_pulse(host_ns):
             state = ClockState.HOLDOVER
         return SampleTime(imu.ahead(session), state)
 
@@ -153,12 +155,11 @@ class Synchroniser:
 
         ``pulse``: whether its status says that it receives the pulse; None: as the board reports.
         """
-        board_ns = self._board_of_host(rx_ns)
-        arrival = None if board_ns is None else self.pulse.session_ns(board_ns)
-        if arrival is None or board_ns is None:
+        arrival = self.session_of_host(rx_ns)
+        if arrival is None:
             self.undated[name] += 1
             return None
-        present = pulse if pulse is not None else not self.pulse.missing_ns(board_ns)
+        present = pulse if pulse is not None else not self._without_pulse(rx_ns)
         lidar = self._lidars.setdefault(name, LidarTime(name))
         dated = lidar.stamp(stamp_ns, clock, arrival, pulse=present)
         if dated.state == ClockState.LOCKED and name == next(iter(self._lidars)):
@@ -175,9 +176,13 @@ class Synchroniser:
     # --- what is known ---
 
     def session_of_host(self, host_ns: int) -> int | None:
-        """Session time at a host time."""
+        """Session time at a host time; until a board that has restarted gives its first pulse, as before."""
         board_ns = self._board_of_host(host_ns)
-        return None if board_ns is None else self.pulse.session_ns(board_ns)
+        session = None if board_ns is None else self.pulse.session_ns(board_ns)
+        if session is None and self._carried is not None:
+            board, pulse = self._carried
+            return pulse.to_y(board.to_x(host_ns))
+        return session
 
     def utc_of_pulse(self, count: int) -> int:
         """What the LiDAR is told after a pulse (command UTC, 10 to 500 ms after it), ns since 1970."""
@@ -211,7 +216,10 @@ class Synchroniser:
     def _board_restarted(self, event: BoardEvent) -> None:
         """Nothing of the old board time holds; session time goes on with a later whole second."""
         if self._boot is not None:
-            self.pulse.restart(self.session_of_host(event.rx_ns))
+            least, board = self.session_of_host(event.rx_ns), self._host.model(self._skew_by_lidar())
+            if board is not None and self.pulse.model is not None:
+                self._carried = board, self.pulse.model
+            self.pulse.restart(least)
         self._boot = event.boot
         self._triggered = False
         self._host.restart()
@@ -229,6 +237,10 @@ class Synchroniser:
     def _board_of_host(self, host_ns: int) -> int | None:
         model = self._host.model(self._skew_by_lidar())
         return None if model is None else model.to_x(host_ns)
+
+    def _without_pulse(self, host_ns: int) -> bool:
+        board_ns = self._board_of_host(host_ns)
+        return board_ns is None or self.pulse.model is None or self.pulse.missing_ns(board_ns) > 0
 
     def _skew_by_lidar(self) -> float | None:
         """Host seconds a board second, minus one, by a LiDAR with pulse; None while there is none.

@@ -28,6 +28,7 @@ from artemis_edge.datasets.rosbag import RosbagSource
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, CameraModel, SyncedFrame, Trajectory
 from artemis_edge.session.messages import (
+    CameraExposure,
     CameraInfo,
     CompressedImage,
     Header,
@@ -131,6 +132,16 @@ def _same_frames(a: Iterable[SyncedFrame], b: Iterable[SyncedFrame]) -> None:
 
 
 # --- frames ---
+
+
+def test_exposures_belong_to_the_photograph_of_their_camera_and_stamp(tmp_path: Path) -> None:
+    records = _drive()
+    stamps = [k * 100 * MS + 12 * MS for k in range(4)]
+    for stamp, exposure in zip(stamps, (0.002, -1.0, float("nan")), strict=False):
+        records.append(("/camera/exposure", CameraExposure(Header(stamp, "cam"), exposure, 1.0), stamp))
+        records.append(("/camera/exposure", CameraExposure(Header(stamp, "other"), 0.004, 1.0), stamp))
+    images = [image for frame in _open(tmp_path, records).frames() for image in frame.images]
+    assert [image.exposure_s for image in images] == [0.002, 0.0, 0.0, 0.0]
 
 
 def test_a_session_is_read_back(tmp_path: Path) -> None:

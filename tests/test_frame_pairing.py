@@ -125,14 +125,58 @@ def test_a_lost_trigger_message_is_bridged_by_its_neighbours() -> None:
 
 
 def test_a_trigger_that_is_never_told_costs_its_frame_only() -> None:
+    """One trigger alone tells no rate."""
     bench = Bench(latency=None)
     bench.pairing.arm(0, 0)
-    for k in range(30):
-        if not 4 <= k < 14:
+    bench.trigger(0)
+    for k in range(14):
+        bench.take(k, k)
+    for k in range(14, 30):
+        bench.trigger(k)
+        bench.take(k, k)
+    assert set(range(14, 30)) <= {count for _, count in bench.paired}
+    assert all(sequence == count for sequence, count in bench.paired)
+    assert len(bench.paired) + bench.pairing.counts["unpaired_no_trigger"] == 30
+    assert bench.pairing.counts["unpaired_no_trigger"] > 0
+
+
+def test_while_the_board_is_not_heard_the_rate_foretells_its_triggers() -> None:
+    """Also an exposure that the camera missed meanwhile is noticed, and nothing waits for the board's return."""
+    bench = Bench(latency=None)
+    bench.pairing.arm(0, 0)
+    for k in range(60):
+        if not 20 <= k < 45:
+            bench.trigger(k)
+        if k != 30:
+            bench.take(k, k if k < 30 else k - 1)
+        bench.pairs += bench.pairing.advance(bench.frame(k, k).rx_ns + 70_000_000)
+        assert len(bench.pairing._pending) <= 1
+    assert [count for _, count in bench.paired] == [k for k in range(60) if k != 30]
+    assert all(pair.edge_ns == pair.count * PERIOD for pair in bench.pairs)
+    assert [pair.count for pair in bench.pairs if pair.interpolated] == [k for k in range(20, 45) if k != 30]
+    assert bench.pairing.counts["reanchored"] == 1
+
+
+def test_a_board_that_is_silent_for_too_long_is_not_guessed() -> None:
+    bench = Bench(latency=None)
+    bench.pairing.arm(0, 0)
+    for k in range(700):
+        if k < 20:
             bench.trigger(k)
         bench.take(k, k)
-    assert bench.paired == [(k, k) for k in range(30) if not 4 <= k < 14]
-    assert bench.pairing.counts["unpaired_no_trigger"] == 10
+    assert bench.paired == [(k, k) for k in range(620)]
+
+
+def test_a_camera_of_unknown_latency_that_restarts() -> None:
+    bench = Bench(latency=None)
+    bench.pairing.arm(0, 0)
+    for k in range(40):
+        bench.trigger(k)
+        if k < 20:
+            bench.take(k, k, late=3_000_000 * (k % 7))
+        elif k >= 27:
+            bench.take(k, k - 27, CAMERA_OFFSET - 10**12, late=3_000_000 * (k % 7))
+    assert bench.paired == [(k, k) for k in range(20)] + [(k - 27, k) for k in range(27, 40)]
 
 
 def test_repeated_and_reordered_frames() -> None:

@@ -238,6 +238,10 @@ def test_exposure_is_in_the_session(session: Path) -> None:
     found = [CameraExposure.decode(data) for data in messages(session / "session.mcap", "/camera/exposure")]
     assert len(found) == 25
     assert all(5e-5 <= item.exposure_s <= 0.005 and 1 <= item.gain <= 8 for item in found)
+    read = [
+        image.exposure_s for frame in open_input(session, InputConfig()).frames() for image in frame.images
+    ]
+    assert read == [item.exposure_s for item in found]
 
 
 def test_points_know_what_they_are(session: Path) -> None:

@@ -52,7 +52,7 @@ def test_frames_are_those_that_the_reader_of_recordings_gives(session: Path) -> 
         (photo,), (image,) = frame.images, other.images
         assert (photo.name, photo.stamp_ns, photo.encoded) == (image.name, image.stamp_ns, image.encoded)
         assert photo.model == image.model and np.allclose(photo.T_cam_lidar, image.T_cam_lidar)
-        assert photo.exposure_s == 0.004
+        assert photo.exposure_s == image.exposure_s == 0.004
 
 
 def test_what_cannot_be_used_is_counted() -> None:

@@ -203,7 +203,10 @@ def test_a_board_that_restarts_never_sets_time_back() -> None:
     before = sync.session_of_host(9019 * SECOND)
     assert before == 1019 * SECOND
     sync.board_event(event(Kind.TRIGGER, 0, 100_000_000, boot=1))
-    assert sync.session_of_host(9100 * SECOND) is None
+    assert sync.session_of_host(9100 * SECOND) == 1100 * SECOND  # carried on
+    sample = sync.imu("imu", 0, 0, 9100 * SECOND + 150_000_000)
+    assert sample is not None and sample.stamp_ns == 1100 * SECOND + 150_000_000
+    assert sync.pulse.model is None and sync.undated == {}
     sync.board_event(event(Kind.PPS, 0, 200_000_000, boot=1))
     after = sync.session_of_host(9100 * SECOND + 200_000_000)
     assert after == 1101 * SECOND  # the first whole second that is not before 1100.1 s

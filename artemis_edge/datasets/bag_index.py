@@ -12,11 +12,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from artemis_edge.datasets.bag import HEAD_BYTES, WHOLE, Bag, Connection, Entry
+from artemis_edge.datasets.cameras import exposure_s
 from artemis_edge.datasets.common import add_counts
 from artemis_edge.datasets.tf_tree import TransformTree
 from artemis_edge.frames import F64, I64
 from artemis_edge.session.cdr import Buffer, CdrError
 from artemis_edge.session.messages import (
+    CameraExposure,
     CameraInfo,
     CompressedImage,
     Header,
@@ -114,6 +116,7 @@ class BagIndex:
         self.imus: dict[str, ImuTrack] = {}
         self.odometries: dict[str, OdometryTrack] = {}
         self.infos: dict[str, CameraInfo] = {}
+        self.exposures: dict[tuple[str, int], float] = {}  # seconds, by frame and stamp of the photograph
         self.tree = TransformTree()
         self.types: dict[str, str] = {}
         self.lost: dict[str, int] = {}
@@ -171,6 +174,10 @@ class BagIndex:
         if connection.topic not in self.infos:
             self.infos[connection.topic] = _read(CameraInfo, connection, entry)
 
+    def _exposure(self, connection: Connection, entry: Entry) -> None:
+        message = _read(CameraExposure, connection, entry)
+        self.exposures[message.header.frame_id, message.header.stamp_ns] = exposure_s(message)
+
     def _transforms(self, connection: Connection, entry: Entry) -> None:
         moving = not connection.topic.endswith(_STATIC_TOPIC)
         for item in _read(TFMessage, connection, entry).transforms:
@@ -202,6 +209,7 @@ def _read(kind: type[_M], connection: Connection, entry: Entry) -> _M:
 _READERS: dict[str, Callable[[BagIndex, Connection, Entry], None]] = {
     Imu.ROS_TYPE: BagIndex._imu,
     CameraInfo.ROS_TYPE: BagIndex._info,
+    CameraExposure.ROS_TYPE: BagIndex._exposure,
     Odometry.ROS_TYPE: BagIndex._odometry,
     **dict.fromkeys(_TRANSFORMS, BagIndex._transforms),
 }

@@ -45,7 +45,10 @@ class Lidar:
 
 @dataclass(frozen=True, slots=True)
 class BagCamera:
-    """A camera: ``T_cam_lidar`` (n, 4, 4) and whether it is known, for each of its images."""
+    """A camera: ``T_cam_lidar`` (n, 4, 4) and whether it is known, for each of its images.
+
+    ``exposure_s`` (n,) is 0 where the recording does not say.
+    """
 
     name: str
     track: Track
@@ -53,6 +56,7 @@ class BagCamera:
     model: CameraModel
     T_cam_lidar: F64
     known: Bool
+    exposure_s: F64
 
     def image(self, k: int) -> bytes:
         """The k-th image as a file; CdrError if it cannot be decoded."""
@@ -102,7 +106,8 @@ def find_cameras(index: BagIndex, config: InputConfig, lidar_frame: str) -> list
         if not known.all():
             _leave_out(index, int((~known).sum()), "images_without_mounting", track, lidar_frame)
         if known.any():
-            cameras.append(BagCamera(_name(track, tracks), track, stamps, model, T, known))
+            exposure = np.array([index.exposures.get((track.frame_id, int(stamp)), 0.0) for stamp in stamps])
+            cameras.append(BagCamera(_name(track, tracks), track, stamps, model, T, known, exposure))
     return cameras
 
 

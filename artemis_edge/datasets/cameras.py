@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from artemis_edge.frames import CameraModel
 from artemis_edge.session.cdr import CdrError
-from artemis_edge.session.messages import CameraInfo, CompressedImage, Image
+from artemis_edge.session.messages import CameraExposure, CameraInfo, CompressedImage, Image
 
 # Lossless, and fast to write rather than small: the file lives as long as its frame.
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+_LONGEST_S = 10.0
 # Image encodings: channels, and the OpenCV conversion to BGR or grey (None: as they are).
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "mono8": (1, None),
@@ -34,6 +35,11 @@ def info_topics(image_topic: str) -> tuple[str, ...]:
     base = image_topic.removesuffix("/compressed")
     folder = base.rpartition("/")[0]
     return (f"{folder}/camera_info", f"{base}/camera_info", f"{folder.rpartition('/')[0]}/camera_info")
+
+
+def exposure_s(message: CameraExposure) -> float:
+    """Seconds; 0, unknown, for what no exposure can be."""
+    return message.exposure_s if 0 < message.exposure_s < _LONGEST_S else 0.0
 
 
 def camera_model(info: CameraInfo, rectified: bool) -> CameraModel | None:

@@ -257,7 +257,7 @@ def _scan(lidar: Lidar, k: int, lost: dict[str, int]) -> LidarScan:
 
 def _photo(camera: BagCamera, k: int) -> CameraImage:
     stamp, T = int(camera.stamp_ns[k]), camera.T_cam_lidar[k].copy()
-    return CameraImage(camera.name, stamp, camera.image(k), camera.model, T)
+    return CameraImage(camera.name, stamp, camera.image(k), camera.model, T, float(camera.exposure_s[k]))
 
 
 def _poses(index: BagIndex, config: InputConfig, lidar_frame: str, stamp_ns: I64) -> Trajectory | None:

@@ -73,6 +73,7 @@ class Capture:
         self._imu_latest_ns = 0
         self._lost_before: Counter[str] = Counter()
         self._started_s = self._synced_s = self._health_s = 0.0
+        self._restarts, self._pulse_boot = 0, -1
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -168,6 +169,8 @@ class Capture:
             self.sync = self._synchroniser(event)
             self._synced_s = time.monotonic()
         self._dated(self.sync.board_event(event))
+        if event.kind == Kind.PPS:
+            self._pulse_boot = event.boot
         if event.kind == Kind.PPS and self._host_pulse is None:
             for lidar in self.rig.livox.lidars:
                 lidar.send_utc(self.sync.utc_of_pulse(event.count))
@@ -187,20 +190,30 @@ class Capture:
         return Synchroniser(timing, latency, epoch)
 
     def _arm(self) -> None:
-        """Once cameras and board run, triggers are begun from 0, so that frames are counted from there."""
+        """Once cameras and board run, triggers are begun from 0, so that frames are counted from there.
+
+        A board that has lost its power stands still when it is back: then once more.
+        """
         board = self.rig.board
-        if board is None or self.rig.armed or board.health()[0].state != State.RUNNING:
+        if board is None or (health := board.health()[0]).state != State.RUNNING:
             return
-        # a board that was running already has told a trigger by then
-        if self.sync is None or time.monotonic() - self._synced_s < _LISTEN_S:
+        if self.rig.armed and health.counters["board_restarts"] != self._restarts:
+            self.rig.armed = False
+            self._synced_s = time.monotonic()
+        if self.rig.armed:
             return
-        ready = all(camera.health()[0].state == State.RUNNING for camera in self.rig.cameras)
+        # photographs are dated by a pulse of this boot; a board that was running already has told a trigger by then
+        pulse = self._pulse_boot == health.counters["board_restarts"]
+        if self.sync is None or not pulse or time.monotonic() - self._synced_s < _LISTEN_S:
+            return
+        there = (State.RUNNING, State.SILENT)
+        ready = all(camera.health()[0].state in there for camera in self.rig.cameras)
         if not ready and time.monotonic() - self._started_s < _ARM_AFTER_S:
             return
         board.command(Opcode.ARM)
         self.sync.arm({feed.name: feed.camera.last_sequence + 1 for feed in self._cameras})
         board.command(Opcode.RUN)
-        self.rig.armed = True
+        self.rig.armed, self._restarts = True, health.counters["board_restarts"]
 
     # --- samples ---
 

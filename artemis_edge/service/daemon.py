@@ -36,7 +36,7 @@ from artemis_edge.service.questions import Desk
 from artemis_edge.service.rig import Rig, make_rig
 from artemis_edge.service.settings import RunConfig
 from artemis_edge.service.status_view import StatusView
-from artemis_edge.session.feed import recorded
+from artemis_edge.session.feed import next_number
 from artemis_edge.session.files import NAME
 from artemis_edge.session.message_ring import MessageRing
 from artemis_edge.status import QueryStatus
@@ -472,7 +472,7 @@ def make_desk(config: RunConfig) -> Desk | None:
 
 def _next_number(session: Path | None) -> int:
     """After the last message of a session that is to be continued."""
-    return 0 if session is None else max((sent.number + 1 for sent in recorded(session, 0)), default=0)
+    return 0 if session is None else next_number(session, 0)
 
 
 def _line(event: dict[str, Any]) -> str:

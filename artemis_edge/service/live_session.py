@@ -24,7 +24,6 @@ from artemis_edge.service.questions import Restarts
 from artemis_edge.service.segmenter_task import SegmenterTask
 from artemis_edge.service.settings import RunConfig
 from artemis_edge.session.asked import Asked
-from artemis_edge.session.feed import recorded
 from artemis_edge.session.messages import Mask
 from artemis_edge.session.recorder import RecorderTask
 from artemis_edge.session.verify import CONFIG_NAME
@@ -90,7 +89,7 @@ class LiveSession:
         self._first = self.outlet.open(
             self.config, self._about, None if self.asked is None else self.asked.plain()
         )
-        self.recorder = self._start_recorder(self._first)
+        self.recorder = self._start_recorder()
         if self.config.service.mapping:
             self.mapper = self._start_mapper()
             if self.asked is not None:
@@ -162,11 +161,11 @@ class LiveSession:
             "battery_minutes": self.machine.minutes,
         }
 
-    def _start_recorder(self, first: int) -> Child:
+    def _start_recorder(self, *, resume: bool = False) -> Child:
         s = self.config.service
         task = RecorderTask(
             str(self.folder),
-            first,
+            self._first,
             {
                 "run.toml": settings.to_toml(self.config),
                 CONFIG_NAME: mapping_config.to_toml(self.config.mapping),
@@ -174,6 +173,7 @@ class LiveSession:
             {"session": {name: str(value) for name, value in self._about.items()}},
             s.split_mb * _MB,
             s.reserve_mb * _MB,
+            resume,
         )
         return Child("artemis_edge.session.recorder", [self.outlet.ring.descriptor], task)
 
@@ -261,11 +261,11 @@ class LiveSession:
             self.fault = self.fault or str(child.latest["full"])
         elif child.process.returncode != 0 and self.recorder_restarts < _MOST_RESTARTS:
             self.recorder_restarts += 1
-            first = max((sent.number + 1 for sent in recorded(self.folder, self._first)), default=self._first)
-            self.recorder = self._start_recorder(first)
+            self.recorder = self._start_recorder(resume=True)
             if self.ended_s is not None:
                 self.recorder.tell("stop")
-            self._tell({"kind": "recorder_restarted", "first": first, "ring_oldest": self.outlet.ring.oldest})
+            message = "the recorder ended; another goes on in a new file, where that one's ends"
+            self._tell({"kind": "recorder_restarted", "message": message})
         elif child.process.returncode != 0:
             self.fault = self.fault or "the recorder keeps ending; see the log"
 

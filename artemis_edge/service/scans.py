@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from artemis_drivers.livox_avia.status import has_pulse
 from artemis_drivers.livox_host import LivoxLidar
 from artemis_drivers.livox_slots import Cloud, collect
 from artemis_drivers.ring import RingReader
@@ -99,7 +100,8 @@ class ScanCutter:
         last = len(slots["stamp_ns"]) - 1
         kind, stamp = int(slots["clock"][last]), int(slots["stamp_ns"][last])
         clock = LidarClock(kind) if kind in _CLOCKS else LidarClock.FREE
-        dated = sync.lidar(self.name, stamp, clock, int(slots["rx_ns"][last]))
+        pulse = has_pulse(int(slots["status"][last]))  # the board may not be heard, and the cable may be cut
+        dated = sync.lidar(self.name, stamp, clock, int(slots["rx_ns"][last]), pulse=pulse)
         if dated is None:
             return None
         return dated.stamp_ns - stamp

@@ -15,7 +15,7 @@ from msgspec import Struct, convert
 
 from artemis_edge import topics
 from artemis_edge.datasets.bag_index import CLOUDS, IMAGES
-from artemis_edge.datasets.cameras import camera_model, encoded_image, info_topics
+from artemis_edge.datasets.cameras import camera_model, encoded_image, exposure_s, info_topics
 from artemis_edge.datasets.clouds import CloudFormat, decode_cloud, point_records, settle_format
 from artemis_edge.datasets.common import add_counts
 from artemis_edge.datasets.tf_tree import TransformTree
@@ -96,7 +96,7 @@ class FrameAssembler:
             self._photo(sent.topic, IMAGES[kind].decode(sent.data))
         elif kind == CameraExposure.ROS_TYPE:
             exposure = CameraExposure.decode(sent.data)
-            self._exposure[exposure.header.frame_id, exposure.header.stamp_ns] = exposure.exposure_s
+            self._exposure[exposure.header.frame_id, exposure.header.stamp_ns] = exposure_s(exposure)
         else:
             self._note(sent)
         return None

@@ -98,6 +98,11 @@ class LiveFeed:
         return sent
 
 
+def next_number(folder: Path, first: int) -> int:
+    """Number of the message after the last one on the disk, ``first`` if that is later."""
+    return max([first, *(GrowingFile(path).latest_number() + 1 for path in bag_files(folder))])
+
+
 def recorded(folder: Path, first: int) -> Iterator[Sent]:
     """Messages from number ``first`` on of the files in ``folder`` that a recorder is writing."""
     wanted = first

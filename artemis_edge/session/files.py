@@ -82,6 +82,11 @@ class SessionFiles:
         except RunError as error:
             self._stop(str(error))
 
+    def latch(self, sent: Sent) -> None:
+        """Keep a message, if it is one that readers need first, for the start of every further file."""
+        if sent.topic in topics.LATCHED or sent.ros_type == topics.CAMERA_INFO.ros_type:
+            self._latched[sent.topic, sent.data] = sent
+
     def tend(self) -> None:
         """To be called often: flushes what has waited, begins a new file, watches the disk."""
         if self.full:
@@ -113,8 +118,7 @@ class SessionFiles:
         if self._writer is None:
             self._open(sent.log_ns)
         assert self._writer is not None
-        if sent.topic in topics.LATCHED or sent.ros_type == topics.CAMERA_INFO.ros_type:
-            self._latched[sent.topic, sent.data] = sent
+        self.latch(sent)
         self._put(self._writer, sent)
         self.messages[sent.topic] += 1
         self.message_bytes[sent.topic] += len(sent.data)

@@ -153,3 +153,34 @@ class GrowingFile:
                 yield Sent(
                     record.sequence, topic, ros_type, record.log_time, record.publish_time, record.data
                 )
+
+    def latest_number(self) -> int:
+        """The highest number in the last whole chunk that has messages, -1 if there is none; the rest is not read.
+
+        InputError if the file cannot be read.
+        """
+        try:
+            with self.path.open("rb") as stream:
+                for at, size in reversed(_chunks(stream)):
+                    stream.seek(at)
+                    found = McapFile(self.path)._content(Opcode.CHUNK, at, stream.read(size))
+                    if numbers := [record.sequence for record in found if isinstance(record, Message)]:
+                        return int(max(numbers))
+        except OSError as error:
+            raise InputError(f"cannot read {self.path}: {error.strerror}") from None
+        return -1
+
+
+def _chunks(stream: IO[bytes]) -> list[tuple[int, int]]:
+    """Place and size of the content of every whole chunk."""
+    end, found = stream.seek(0, 2), []
+    at = stream.seek(len(MAGIC))
+    while at + _RECORD.size <= end:
+        opcode, size = _RECORD.unpack(stream.read(_RECORD.size))
+        at += _RECORD.size + size
+        if opcode == 0:  # nothing was written here
+            break
+        if opcode == Opcode.CHUNK and at <= end:
+            found.append((at - size, size))
+        stream.seek(at)
+    return found

@@ -7,16 +7,19 @@ still written and the file is closed.
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import sys
 import time
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from msgspec import Struct
 
+from artemis_edge.session.feed import next_number, recorded
 from artemis_edge.session.files import Limits, SessionFiles
 from artemis_edge.session.line_channel import LineChannel
 from artemis_edge.session.message_ring import MessageRing, RingReader
@@ -25,12 +28,16 @@ from artemis_edge.topics import RAW
 _POLL_S = 0.02
 _BATCH = 256
 _SAY_S = 1.0
+_BEGINNING = 200  # messages of a session, among which those are that readers need first
 _CROWDED, _EASY = 0.5, 0.1  # fill of the ring at which raw packets are left out, and are taken again
 _PATIENCE_S = 8.0  # for what is in the ring when it has to stop
 
 
 class RecorderTask(Struct, frozen=True):
-    """What the service tells a recorder: see SessionFiles; ``first`` is the number of the first message."""
+    """What the service tells a recorder: see SessionFiles; ``first`` is the number of the first message.
+
+    ``resume``: another recorder has died; from the first message on that is not on the disk.
+    """
 
     folder: str
     first: int = 0
@@ -38,6 +45,7 @@ class RecorderTask(Struct, frozen=True):
     metadata: dict[str, dict[str, str]] = {}
     split_bytes: int = Limits().split_bytes
     reserve_bytes: int = Limits().reserve_bytes
+    resume: bool = False
 
 
 class Recorder:
@@ -45,8 +53,14 @@ class Recorder:
 
     def __init__(self, task: RecorderTask, ring: MessageRing, channel: LineChannel) -> None:
         limits = Limits(task.split_bytes, task.reserve_bytes)
-        self.files = SessionFiles(Path(task.folder), task.attachments, task.metadata, limits)
-        self.reader = RingReader(ring, task.first)
+        folder = Path(task.folder)
+        self.files = SessionFiles(folder, task.attachments, task.metadata, limits)
+        first = task.first
+        if task.resume:
+            for sent in islice(recorded(folder, first), _BEGINNING):
+                self.files.latch(sent)
+            first = next_number(folder, first)
+        self.reader = RingReader(ring, first)
         self.left_out = 0
         self._channel = channel
         self._stop_at: int | None = None
@@ -93,6 +107,7 @@ class Recorder:
             "full": files.full,
             "ring": round(self.reader.fill(), 3),
             "next": self.reader.next,
+            "pid": os.getpid(),
             "cpu_s": round(time.process_time(), 3),
         }
 

@@ -28,6 +28,7 @@ from artemis_drivers.virtual.wire_stream import SHOTS_PER_S, Shots
 from artemis_drivers.virtual.wire_trigger import WireTrigger
 
 from artemis_edge.datasets.bag_index import IMAGES
+from artemis_edge.datasets.cameras import exposure_s
 from artemis_edge.datasets.clouds import point_records
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.export.atomic import write_bytes
@@ -86,7 +87,8 @@ def read(session: Path) -> Played:
             played.photos.append((photo.header.stamp_ns, _EXPOSURE_NS, photo))
         elif kind == CameraExposure.ROS_TYPE:
             exposure = CameraExposure.decode(sent.data)
-            exposures[exposure.header.stamp_ns] = round(exposure.exposure_s * 1e9)
+            if known := exposure_s(exposure):
+                exposures[exposure.header.stamp_ns] = round(known * 1e9)
         else:
             assembler.take(sent)
     if not played.windows:
@@ -122,7 +124,7 @@ class WireRig:
         self.start_ns: int | None = None
         self.over = threading.Event()
         self.counts = {"photos": 0, "photos_unseen": 0}
-        self._sequence = 0
+        self._sequence = self._camera_boot_ns = 0
         self.avia = VirtualAvia(ip=ip, announce_to=ip)
         self.board = WireTrigger(
             folder / "can", on_trigger=self._trigger, on_pps=lambda _, at: self.avia.pulse(at)
@@ -181,6 +183,17 @@ class WireRig:
             boot = self.board.firmware.boot_ns
             start += -(earliest + edge - boot) % _TRIGGER_NS
         self.start_ns = start
+
+    def unplug_camera(self) -> None:
+        """Pull its cable, which is its power as well."""
+        if self.camera is not None:
+            self.camera.unplug()
+
+    def replug_camera(self) -> None:
+        """A camera that starts counts from 0, and so does its clock."""
+        if self.camera is not None:
+            self._sequence, self._camera_boot_ns = 0, time.monotonic_ns()
+            self.camera.plug()
 
     def truth_of(self, stamp_ns: int) -> int | None:
         """When something of the session happens, by the monotonic clock; None before ``begin``."""
@@ -256,7 +269,7 @@ class WireRig:
         encoding = message.format if isinstance(message, CompressedImage) else message.encoding
         frame = CameraFrame(
             self._sequence,
-            edge_ns + exposure,
+            edge_ns + exposure - self._camera_boot_ns,
             exposure,
             model.width,
             model.height,

@@ -15,7 +15,7 @@ from artemis_drivers.device_thread import DeviceThread
 from artemis_drivers.ring import Ring
 
 _WAIT_S = 0.05
-SILENT_S = 1.0  # without a photograph, while others say that triggers run
+SILENT_S = 0.8  # without a photograph, while others say that triggers run
 
 
 class Camera(DeviceThread):

@@ -10,6 +10,11 @@ PPS_BIT = 1 << 9
 SYNC_SHIFT = 14
 
 
+def has_pulse(code: int) -> bool | None:
+    """Whether time follows the pulse per second; None where the code does not say (0: also of an SDK 2 device)."""
+    return {2: True, 3: True, 4: False}.get(code >> SYNC_SHIFT & 7)
+
+
 class Status(NamedTuple):
     """Decoded status code; levels are ``ok``, ``warning`` or ``error``."""
 

@@ -39,7 +39,7 @@ from artemis_drivers.trigger.messages import (
 )
 from artemis_drivers.trigger.settings import TriggerSettings
 
-SILENT_S = 0.9  # heartbeats come twice a second
+SILENT_S = 0.75  # heartbeats come twice a second
 _RECEIVE_S = 0.05
 _SDO_S = 0.2
 _BUTTONS = 4
@@ -72,6 +72,7 @@ class TriggerBoard(DeviceThread):
         self._heard_s = 0.0
         self._health: BoardHealth | None = None
         self._fault: Emcy | None = None
+        self._led = 0
         self._counts = {"unplugged": 0, "silent": 0, "bad_frames": 0, "other_frames": 0, "board_restarts": 0}
         self._counts |= {"overruns": 0, "unsent": 0}
 
@@ -124,9 +125,11 @@ class TriggerBoard(DeviceThread):
                 failures = 0
                 self._receive(self._bus)
             except (DriverError, OSError, can.CanError) as fault:
-                if failures == 0 and self._state == State.RUNNING:
+                if self._state == State.RUNNING:
                     self._counts["unplugged"] += 1
-                self._become(State.SEARCHING, f"{self.settings.name}: {fault}")
+                    self._become(State.SEARCHING, f"{self.settings.name} was unplugged: plug it in again")
+                else:
+                    self._become(State.SEARCHING, f"{self.settings.name}: {fault}")
                 self._pause(failures)
                 failures += 1
             finally:

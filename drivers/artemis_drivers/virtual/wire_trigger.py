@@ -259,6 +259,12 @@ class WireTrigger(WireDevice):
         """Only the stick loses its power: the board goes on."""
         self.opened = False
 
+    def power_cycle(self) -> None:
+        """The board itself loses its power for a moment."""
+        with self._lock:
+            self._outbox.clear()
+            self._queue(self.firmware.power_on(self._now()), self._now())
+
     def press(self, button: int, *, down: bool) -> None:
         """A finger on a button."""
         with self._lock:
