@@ -47,6 +47,7 @@ class Seen:
     photos: int = 0
     packets: dict[str, int] = field(default_factory=dict)
     packets_before: int = 0
+    pulses: tuple[int, int] = (0, 0)  # named in time, and too early or too late
 
 
 @contextmanager
@@ -139,3 +140,5 @@ def finish(service: Service, rig: WireRig, seen: Seen) -> None:
     service.process.send_signal(signal.SIGTERM)
     seen.code = service.process.wait(PATIENCE_S)
     seen.photos, seen.packets = rig.counts["photos"], dict(rig.avia.counters)
+    clock = rig.avia.device_time
+    seen.pulses = clock.utc_named, clock.utc_late

@@ -98,6 +98,12 @@ def test_the_imu_has_no_other_gap(found: dict[str, list[Sent]]) -> None:
     assert abs(sent_by_it - len(steps) - 1) < 100, "bytes are recorded ten times a second, samples at once"
 
 
+def test_every_pulse_is_named_when_the_lidar_takes_it(run: tuple[Path, Seen]) -> None:
+    """10 to 500 ms after the edge; those that the cable and the board's silence cost are not told at all."""
+    named, late = run[1].pulses
+    assert named > 5 and late <= 1
+
+
 def test_the_lidar_has_no_other_gap(run: tuple[Path, Seen], found: dict[str, list[Sent]]) -> None:
     _, seen = run
     packets = sum(len(RawPackets.decode(sent.data).size) for sent in found[topics.LIDAR_PACKETS.name])

@@ -40,6 +40,8 @@ _IMAGE_PATIENCE_NS = 150_000_000  # after the end of a window
 _SAMPLE_PATIENCE_NS = 30_000_000
 _GAP_NS = 500_000_000  # a LiDAR behind by more is not waited for
 _LISTEN_S = 0.3
+# The Avia takes the time of a pulse 10 to 500 ms after it (user manual); the message of a pulse takes some ms.
+_NAMED_AFTER_NS, _NAMED_WITHIN_NS = 50_000_000, 400_000_000
 _ARM_AFTER_S = 5.0  # for cameras that do not come
 _HELD = 32  # photographs that wait for their time
 _STEPS = {"mono8": 1, "bgr8": 3, "rgb8": 3, "bayer_rggb8": 1}
@@ -74,6 +76,7 @@ class Capture:
         self._lost_before: Counter[str] = Counter()
         self._started_s = self._synced_s = self._health_s = 0.0
         self._restarts, self._pulse_boot = 0, -1
+        self._unnamed: tuple[int, int] | None = None  # when a pulse was heard of, and its time
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -131,6 +134,7 @@ class Capture:
         self.turn_s = time.monotonic()
         now = time.monotonic_ns()
         self._board(now)
+        self._name_pulse(now)
         self._arm()
         for cutter in self._cutters:
             cutter.read(self.sync)
@@ -171,9 +175,19 @@ class Capture:
         self._dated(self.sync.board_event(event))
         if event.kind == Kind.PPS:
             self._pulse_boot = event.boot
-        if event.kind == Kind.PPS and self._host_pulse is None:
-            for lidar in self.rig.livox.lidars:
-                lidar.send_utc(self.sync.utc_of_pulse(event.count))
+            if self._host_pulse is None:
+                self._unnamed = (event.rx_ns, self.sync.utc_of_pulse(event.count))
+
+    def _name_pulse(self, now: int) -> None:
+        """Tell the LiDARs the time of the latest pulse: not too soon and not too late after it, or not at all."""
+        if self._unnamed is None or now - self._unnamed[0] < _NAMED_AFTER_NS:
+            return
+        (heard_ns, utc_ns), self._unnamed = self._unnamed, None
+        if now - heard_ns > _NAMED_WITHIN_NS:
+            self.lost["pulses_not_named"] += 1
+            return
+        for lidar in self.rig.livox.lidars:
+            lidar.send_utc(utc_ns)
 
     def _synchroniser(self, event: BoardEvent) -> Synchroniser:
         config = self.rig.config
