@@ -8,7 +8,7 @@ LEARNT ?= train-out
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint bench soak ablation viewer-test terminal-test cluster-test train install-service clean
+.PHONY: help setup demo test lint bench soak wire ablation viewer-test terminal-test cluster-test train install-service clean
 
 help:
 	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
@@ -16,6 +16,7 @@ help:
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   what a frame costs on this machine"
 	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
+	@echo "make wire    a minute played on the wire by virtual devices: losses and CPU of the service (some minutes)"
 	@echo "make viewer-test  GLB and browser view in headless Chromium (fetches three.js with npm)"
 	@echo "make terminal-test  demo --tui in tmux at 80x24 and 160x48, from its start to its report (some minutes)"
 	@echo "make cluster-test  four recordings on two Dask workers, one of which is killed (a minute or two)"
@@ -52,6 +53,11 @@ bench: $(READY)
 
 soak: $(READY)
 	@$(BIN)/python tests/soak/walk.py
+
+wire: $(READY)
+	@$(BIN)/python tests/soak/wire_minute.py
+	@$(BIN)/python tests/bench/bench_livox.py --seconds 30 --mode triple
+	@$(BIN)/python tests/soak/replug_devices.py
 
 viewer-test: $(READY)
 	@command -v npm >/dev/null || { echo "npm is needed: on Debian and Ubuntu: apt install npm chromium"; exit 2; }

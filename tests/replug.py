@@ -47,7 +47,7 @@ class Seen:
     photos: int = 0
     packets: dict[str, int] = field(default_factory=dict)
     packets_before: int = 0
-    pulses: tuple[int, int] = (0, 0)  # named in time, and too early or too late
+    pulses: tuple[int, int] = (0, 0)  # named in time, and too early
 
 
 @contextmanager
@@ -63,15 +63,18 @@ def recording_rig(tmp: Path) -> Iterator[tuple[WireRig, Service]]:
         service = Service(rig, tmp / "recorded", tmp)
         try:
             assert until(service.listens, PATIENCE_S, 0.1), service.said()
-            assert until(lambda: _paired(service) > 5, PATIENCE_S, 0.1), service.said()
+            assert until(lambda: _records(service), PATIENCE_S, 0.1), service.said()
             yield rig, service
         finally:
             service.end()
 
 
-def _paired(service: Service) -> int:
+def _records(service: Service) -> bool:
+    """Whether photographs are paired, and the recorder says that it writes."""
     state = service.state()
-    return int(state["pairing"]["cam_0"].get("paired", 0)) if state["phase"] == "recording" else 0
+    if state["phase"] != "recording" or state["pairing"]["cam_0"].get("paired", 0) < 6:
+        return False
+    return bool(state["session"]["recorder"].get("messages", 0))
 
 
 def device(service: Service, name: str) -> dict[str, Any]:
@@ -141,4 +144,4 @@ def finish(service: Service, rig: WireRig, seen: Seen) -> None:
     seen.code = service.process.wait(PATIENCE_S)
     seen.photos, seen.packets = rig.counts["photos"], dict(rig.avia.counters)
     clock = rig.avia.device_time
-    seen.pulses = clock.utc_named, clock.utc_late
+    seen.pulses = clock.utc_named, clock.utc_early

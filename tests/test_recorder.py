@@ -14,8 +14,10 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from artemis_edge.session import verify
+from artemis_edge.session.feed import next_number
 from artemis_edge.session.files import FLUSH_S, Limits, SessionFiles
 from artemis_edge.session.line_channel import LineChannel
+from artemis_edge.session.mcap_file import GrowingFile
 from artemis_edge.session.message_ring import MessageRing
 from artemis_edge.session.recorder import Recorder, RecorderTask
 from artemis_edge.session.recover import recover
@@ -64,6 +66,30 @@ def test_when_the_service_dies_the_recorder_closes_the_file(tmp_path: Path) -> N
     recorder.process.wait(20.0)
     assert recorder.process.returncode == 0
     assert numbers(tmp_path / "session_000.mcap") == list(range(100))
+
+
+def test_another_recorder_goes_on_where_a_killed_one_ends(tmp_path: Path) -> None:
+    """In a new file that stands alone; nothing twice, nothing missing, also what was published meanwhile."""
+    ring = MessageRing.create(4)
+    first = start_recorder(ring, tmp_path, first=3)
+    for k in range(3):
+        publish(ring, sent(k))
+    publish(ring, sent(3, topic=TF_STATIC.name))
+    for k in range(4, 200):
+        publish(ring, sent(k))
+    assert until(lambda: bool(first.hear()) and first.latest.get("messages", 0) == 197, 30.0)
+    assert until(lambda: GrowingFile(tmp_path / "session_000.mcap").latest_number() >= 0, 30.0)
+    first.process.kill()
+    first.end(20.0)
+    for k in range(200, 260):
+        publish(ring, sent(k))
+    second = start_recorder(ring, tmp_path, first=3, resume=True)
+    second.tell("stop")
+    second.end(30.0)
+    assert second.process.returncode == 0 and second.latest["lost"] == 0
+    kept, rest = (numbers(tmp_path / f"session_00{k}.mcap") for k in range(2))
+    assert kept[0] == rest[0] == 3 and kept + rest[1:] == list(range(3, 260))
+    assert next_number(tmp_path, 0) == 260 and next_number(tmp_path, 300) == 300
 
 
 @pytest.mark.parametrize("after_s", [0.4, 1.7])

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import resource
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Message
 
 from artemis_edge import topics
 from artemis_edge.cli import main
 from artemis_edge.datasets import open_input
 from artemis_edge.errors import InputError
 from artemis_edge.session.files import Limits, SessionFiles
+from artemis_edge.session.mcap_file import MAGIC, McapFile
 from artemis_edge.session.recover import recover
 from artemis_edge.session.verify import verify
 from artemis_edge.session.writer import SessionWriter
@@ -115,6 +119,73 @@ def test_any_damage_is_survived(tmp_path: Path) -> None:
         assert verify(copy)[0].problems == []
         assert set(numbers(copy)) <= set(range(12))
         verify(torn)
+
+
+def _zeros(data: bytes, at: int, size: int) -> bytes:
+    return data[:at] + bytes(min(size, len(data) - at)) + data[at + size :]
+
+
+def _left_out(data: bytes, at: int, size: int) -> bytes:
+    return data[:at] + data[at + size :]
+
+
+def _repeated(data: bytes, at: int, size: int) -> bytes:
+    return data[: at + size] + data[at:]
+
+
+def _swapped(data: bytes, at: int, size: int) -> bytes:
+    return data[:at] + data[at + size : at + 2 * size] + data[at : at + size] + data[at + 2 * size :]
+
+
+def _long(data: bytes, at: int, size: int) -> bytes:
+    """A length, or whatever stands there, is enormous."""
+    return data[:at] + b"\xff" * 8 + data[at + 8 :]
+
+
+def _followed(data: bytes, at: int, size: int) -> bytes:
+    """The file goes on behind its end with a part of itself, as in a block that was another file's."""
+    return data + data[at : at + size]
+
+
+@pytest.mark.parametrize("damage", [_zeros, _left_out, _repeated, _swapped, _long, _followed])
+def test_what_disks_do_is_survived(
+    damage: Callable[[bytes, int, int], bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Blocks lost, repeated or exchanged: no command fails but with a sentence, no message is invented or altered."""
+    folder = tmp_path / "walk"
+    path = _session(folder, 1)
+    data, rng = path.read_bytes(), np.random.default_rng(5)
+    true = {message.data for _, message in McapFile(path).records() if isinstance(message, Message)}
+    for k in range(8):
+        at = int(rng.integers(0, len(data) - 8)) if k else len(MAGIC)
+        path.write_bytes(damage(data, at, int(rng.choice([16, 64, 512]))))
+        out = tmp_path / f"out{k}"
+        verdicts = [main(["session", word, str(folder)]) for word in ("verify", "info")]
+        verdicts.append(main(["session", "recover", str(folder), "--out", str(out)]))
+        verdicts.append(
+            main(["session", "trim", str(folder), "--to", "1", "--out", str(tmp_path / f"part{k}")])
+        )
+        assert set(verdicts) <= {0, 1, 2} and main(["session", "list", str(tmp_path)]) == 0
+        for copy in out.glob("*.mcap"):
+            assert verify(copy)[0].problems == []
+            found = [m.data for _, m in McapFile(copy).records() if isinstance(m, Message)]
+            assert set(found) <= true
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_length_may_claim_what_it_likes(tmp_path: Path) -> None:
+    """Every eight bytes of the file once as a number beyond all bounds: no memory is asked for."""
+    path = _recording(tmp_path, 1, 2)
+    data, torn = path.read_bytes(), tmp_path / "torn.mcap"
+    limit = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), limit[1]))
+    try:
+        for at in range(len(MAGIC), len(data) - 8, 3):
+            torn.write_bytes(data[:at] + b"\xfe\xff\xff\xff\0\0\0\0" + data[at + 8 :])
+            verify(torn)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limit)
 
 
 def test_no_file_is_overwritten(tmp_path: Path) -> None:

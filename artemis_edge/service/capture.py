@@ -40,6 +40,7 @@ _IMAGE_PATIENCE_NS = 150_000_000  # after the end of a window
 _SAMPLE_PATIENCE_NS = 30_000_000
 _GAP_NS = 500_000_000  # a LiDAR behind by more is not waited for
 _LISTEN_S = 0.3
+_STILL_S = 0.3  # photographs that were on their way when the triggers stopped have arrived then
 # The Avia takes the time of a pulse 10 to 500 ms after it (user manual); the message of a pulse takes some ms.
 _NAMED_AFTER_NS, _NAMED_WITHIN_NS = 50_000_000, 400_000_000
 _ARM_AFTER_S = 5.0  # for cameras that do not come
@@ -76,6 +77,7 @@ class Capture:
         self._lost_before: Counter[str] = Counter()
         self._started_s = self._synced_s = self._health_s = 0.0
         self._restarts, self._pulse_boot = 0, -1
+        self._still_s: float | None = None  # since when triggers are stopped
         self._unnamed: tuple[int, int] | None = None  # when a pulse was heard of, and its time
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -224,7 +226,12 @@ class Capture:
         ready = all(camera.health()[0].state in there for camera in self.rig.cameras)
         if not ready and time.monotonic() - self._started_s < _ARM_AFTER_S:
             return
-        board.command(Opcode.ARM)
+        if self._still_s is None:
+            board.command(Opcode.ARM)
+            self._still_s = time.monotonic()
+        if time.monotonic() - self._still_s < _STILL_S:
+            return
+        self._still_s = None
         self.sync.arm({feed.name: feed.camera.last_sequence + 1 for feed in self._cameras})
         board.command(Opcode.RUN)
         self.rig.armed, self._restarts = True, health.counters["board_restarts"]

@@ -18,7 +18,7 @@ class DeviceClock:
         self._origin, self._skew = power_on_ns, skew_ppm * 1e-6
         self._edge: int | None = None
         self._utc_of_edge: int | None = None
-        self.utc_named = self.utc_late = 0
+        self.utc_named = self.utc_early = self.utc_late = 0
 
     def pulse(self, true_ns: int) -> None:
         """A rising PPS edge."""
@@ -28,9 +28,12 @@ class DeviceClock:
 
     def name_edge(self, unix_ns: int, true_ns: int) -> None:
         """A UTC command arrived; too early or too late after the edge it means nothing."""
-        if self._edge is not None and _UTC_EARLIEST < true_ns - self._edge < _UTC_LATEST:
+        since = _UTC_LATEST if self._edge is None else true_ns - self._edge
+        if _UTC_EARLIEST < since < _UTC_LATEST:
             self._utc_of_edge = unix_ns
             self.utc_named += 1
+        elif since <= _UTC_EARLIEST:
+            self.utc_early += 1
         else:
             self.utc_late += 1
 
