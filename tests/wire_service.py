@@ -12,7 +12,7 @@ from typing import Any
 from artemis_edge.session.wire_replay import WireRig
 from tests.control_client import ask
 
-PATIENCE_S = 240.0
+PATIENCE_S = 180.0
 
 
 class Service:
