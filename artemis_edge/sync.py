@@ -85,9 +85,8 @@ class Synchroniser:
         self._series: int | None = None
         self._armed = False
         self._triggered = False  # whether a trigger of this boot was told
-        self._carried: tuple[AffineClock, AffineClock] | None = (
-            None  # board to host, board to session: a boot before
-        )
+        # of the boot before: board to host, and board to session
+        self._carried: tuple[AffineClock, AffineClock] | None = None
         self.undated: Counter[str] = Counter()
 
     # --- what the devices say ---
@@ -138,13 +137,14 @@ class Synchroniser:
         """Session time of a sample; None while the board is unknown. Never goes back within a boot."""
         imu = self._imus[name]
         host_ns = imu.host_ns(device_ns, boot, rx_ns)
-        session = self.session_of_host(host_ns)
+        board_ns = self._board_of_host(host_ns)
+        session = self._session(board_ns, host_ns)
         if session is None:
             self.undated[name] += 1
             return None
         span = min(self._host.span_s, imu.fit.span_s)
         state = ClockState.LOCKED if span >= SETTLED_S else ClockState.SETTLING
-        if state == ClockState.LOCKED and self._without_pulse(host_ns):
+        if state == ClockState.LOCKED and self._without_pulse(board_ns):
             state = ClockState.HOLDOVER
         return SampleTime(imu.ahead(session), state)
 
@@ -155,11 +155,12 @@ class Synchroniser:
 
         ``pulse``: whether its status says that it receives the pulse; None: as the board reports.
         """
-        arrival = self.session_of_host(rx_ns)
+        board_ns = self._board_of_host(rx_ns)
+        arrival = self._session(board_ns, rx_ns)
         if arrival is None:
             self.undated[name] += 1
             return None
-        present = pulse if pulse is not None else not self._without_pulse(rx_ns)
+        present = pulse if pulse is not None else not self._without_pulse(board_ns)
         lidar = self._lidars.setdefault(name, LidarTime(name))
         dated = lidar.stamp(stamp_ns, clock, arrival, pulse=present)
         if dated.state == ClockState.LOCKED and name == next(iter(self._lidars)):
@@ -177,7 +178,9 @@ class Synchroniser:
 
     def session_of_host(self, host_ns: int) -> int | None:
         """Session time at a host time; until a board that has restarted gives its first pulse, as before."""
-        board_ns = self._board_of_host(host_ns)
+        return self._session(self._board_of_host(host_ns), host_ns)
+
+    def _session(self, board_ns: int | None, host_ns: int) -> int | None:
         session = None if board_ns is None else self.pulse.session_ns(board_ns)
         if session is None and self._carried is not None:
             board, pulse = self._carried
@@ -238,8 +241,7 @@ class Synchroniser:
         model = self._host.model(self._skew_by_lidar())
         return None if model is None else model.to_x(host_ns)
 
-    def _without_pulse(self, host_ns: int) -> bool:
-        board_ns = self._board_of_host(host_ns)
+    def _without_pulse(self, board_ns: int | None) -> bool:
         return board_ns is None or self.pulse.model is None or self.pulse.missing_ns(board_ns) > 0
 
     def _skew_by_lidar(self) -> float | None:

@@ -77,15 +77,15 @@ def test_another_recorder_goes_on_where_a_killed_one_ends(tmp_path: Path) -> Non
     publish(ring, sent(3, topic=TF_STATIC.name))
     for k in range(4, 200):
         publish(ring, sent(k))
-    assert until(lambda: bool(first.hear()) and first.latest.get("messages", 0) == 197, 30.0)
-    assert until(lambda: GrowingFile(tmp_path / "session_000.mcap").latest_number() >= 0, 30.0)
+    assert until(lambda: bool(first.hear()) and first.latest.get("messages", 0) == 197, 90.0)
+    assert until(lambda: GrowingFile(tmp_path / "session_000.mcap").latest_number() >= 0, 90.0)
     first.process.kill()
     first.end(20.0)
     for k in range(200, 260):
         publish(ring, sent(k))
     second = start_recorder(ring, tmp_path, first=3, resume=True)
     second.tell("stop")
-    second.end(30.0)
+    second.end(90.0)
     assert second.process.returncode == 0 and second.latest["lost"] == 0
     kept, rest = (numbers(tmp_path / f"session_00{k}.mcap") for k in range(2))
     assert kept[0] == rest[0] == 3 and kept + rest[1:] == list(range(3, 260))
