@@ -72,7 +72,6 @@ class TriggerBoard(DeviceThread):
         self._heard_s = 0.0
         self._health: BoardHealth | None = None
         self._fault: Emcy | None = None
-        self._led = 0
         self._counts = {"unplugged": 0, "silent": 0, "bad_frames": 0, "other_frames": 0, "board_restarts": 0}
         self._counts |= {"overruns": 0, "unsent": 0}
 
