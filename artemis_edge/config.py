@@ -372,7 +372,7 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
             ge=1000,
             le=100_000_000,
         ),
-    ] = 100_000
+    ] = 60_000
     wait_frames: Annotated[
         int, Meta(description="Frames after which an image is used, if its surface is meshed.", ge=0, le=1000)
     ] = 6
