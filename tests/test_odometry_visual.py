@@ -155,6 +155,7 @@ def test_no_patches_no_image_and_two_cameras() -> None:
     assert visual.update(state, path, broken, scan, planes) is state
     visual.remember(state, path, broken, scan, planes)
     assert visual.lost == {"images not decodable": 1} and picture(broken) is None
+    assert picture(replace(broken, encoded=b"")) is None  # held out: only its pose is asked for
     none = SeenScan(np.empty((0, 3), np.float32))
     visual.remember(state, path, _photograph(np.eye(4)), none, planes)
     state = visual.update(state, path, _photograph(np.eye(4), name="other"), none, planes)

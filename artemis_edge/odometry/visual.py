@@ -58,7 +58,9 @@ class Picture(NamedTuple):
 
 
 def picture(image: CameraImage) -> Picture | None:
-    """Decode an image, at half its size where it is wide; None if it cannot be."""
+    """Decode an image, at half its size where it is wide; None if it cannot be or, held out, has no data."""
+    if not image.encoded:
+        return None
     model = image.model
     half = model.width > _WIDEST
     flag = cv2.IMREAD_REDUCED_GRAYSCALE_2 if half else cv2.IMREAD_GRAYSCALE
@@ -189,7 +191,7 @@ class VisualUpdate:
         """Decoded once for both calls."""
         if self._last is None or self._last[:2] != (image.name, image.stamp_ns):
             decoded = picture(image)
-            if decoded is None:
+            if decoded is None and image.encoded:
                 self._count("images not decodable")
             self._last = image.name, image.stamp_ns, decoded
         return self._last[2]
