@@ -49,8 +49,8 @@ class Place(NamedTuple):
     @property
     def clear(self) -> bool:
         """Are walls that only this place explains too many for chance? What neither explains counts as its noise."""
-        noise = (self.walls * (2.0 - self.share - self.other)) ** 0.5
-        return self.walls * (self.share - self.other) > _CLEAR * noise
+        noise = float(self.walls * (2.0 - self.share - self.other)) ** 0.5
+        return bool(self.walls * (self.share - self.other) > _CLEAR * noise)
 
 
 class Recognition:

@@ -168,8 +168,8 @@ def compare(
 ) -> Comparison:
     """Compare an image at a level with all patches; ``log_exposure`` is the image's log inverse exposure.
 
-    The residual is I exp(l - l_ref) - I_ref, ``sigma`` its deviation in grey levels; a patch's pixels err alike
-    and count as one row of them.
+    The residual is I exp(l - l_ref) - I_ref, ``sigma`` its deviation in grey levels; a patch's pixels err alike (its
+    place, its plane, blur) and count as one of them.
     """
     m, scale = len(patches.anchor), 2.0**level
     H, g = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
@@ -195,7 +195,7 @@ def compare(
         share[n] = robust
         score += robust
         count += 1
-        weight = robust / (sigma * sigma * SIDE)
+        weight = robust / (sigma * sigma * _PIXELS)
         for k in range(6):
             g[k] += weight * (B[0, k] * se + B[1, k] * te)
             left, right = ss * B[0, k] + st * B[1, k], st * B[0, k] + tt * B[1, k]
