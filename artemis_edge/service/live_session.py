@@ -32,7 +32,7 @@ RESULT = "result"
 _MB = 1_000_000
 _MOST_RESTARTS = 5
 _MAPPING_NICE = 5  # capture and recording go first
-_SEGMENTER_NICE = 15  # it has what the mapping leaves: late by design
+_SEGMENTER_NICE = 10  # it may have what the mapping leaves: late by design
 _JUDGE_S = 0.25
 _PR_SET_CHILD_SUBREAPER = 36
 

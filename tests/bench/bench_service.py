@@ -124,6 +124,8 @@ def watch(seconds: float, control: Path, pid: int) -> dict[str, Any]:
             **{d["name"]: d["counters"].get("points_lost", 0) for d in state["devices"]},
         },
         "reduced": state["session"].get("reduced"),
+        "sent": state["sent"],
+        "pairing": state["pairing"],
         "segmentation": {
             k: v for k, v in (state["session"].get("segmentation") or {}).items() if k != "answers"
         },
