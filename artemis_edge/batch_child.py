@@ -1,8 +1,8 @@
 """One recording of a batch mapped in a process of its own: started here or by a worker of a cluster.
 
-``python -m artemis_edge.batch_child TASK``: the task is JSON, and so is every line on stdout: ``done``, ``total`` and
-``note`` while it works, at the end ``report`` and ``warnings``, or ``error`` with its exit ``code``. It ends when the
-process that started it does: what a killed worker had begun must not go on beside the one that does it again.
+``python -m artemis_edge.batch_child TASK PARENT``: the task is JSON, the parent a process id. Lines on stdout are JSON:
+``done``, ``total`` and ``note`` while it works, at the end ``report`` and ``warnings``, or ``error`` with its exit
+``code``. It ends when its parent does: what a killed worker had begun must not go on beside the one that does it again.
 """
 
 from __future__ import annotations
@@ -93,7 +93,13 @@ class Child:
         self.result: Done | None = None
         self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115  (closed by the thread that reads to the end)
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "artemis_edge.batch_child", msgspec.json.encode(task).decode()],
+            [
+                sys.executable,
+                "-m",
+                "artemis_edge.batch_child",
+                msgspec.json.encode(task).decode(),
+                str(os.getpid()),
+            ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=self._said,
@@ -139,7 +145,7 @@ def _ended(code: int, last: str) -> str:
 def main(arguments: list[str]) -> int:
     """The child."""
     task = msgspec.json.decode(arguments[0], type=Task)
-    _end_with_the_parent(task.orphaned)
+    _end_with_the_parent(task.orphaned, int(arguments[1]))
     request = task.request()
     _clear(request.out)
     last = 0.0
@@ -177,11 +183,10 @@ def _clear(out: Path) -> None:
                 path.unlink(missing_ok=True)
 
 
-def _end_with_the_parent(number: int) -> None:
-    parent = os.getppid()
+def _end_with_the_parent(number: int, parent: int) -> None:
     with contextlib.suppress(OSError, AttributeError):  # Linux only; elsewhere it goes on to its end
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
-    if os.getppid() != parent:
+    if os.getppid() != parent:  # it died while this one began
         os.kill(os.getpid(), number)
 
 

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -121,6 +123,18 @@ def test_a_process_that_is_killed_is_told(tmp_path: Path) -> None:
     assert child.result is not None and "ended by signal 9" in child.result.error
 
 
+def test_a_process_whose_parent_died_while_it_began_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[int] = []
+    monkeypatch.setattr(batch_child.os, "kill", lambda pid, number: sent.append(number))
+    monkeypatch.setattr(batch_child.ctypes, "CDLL", lambda _: SimpleNamespace(prctl=lambda *_: 0))
+    batch_child._end_with_the_parent(9, os.getppid())
+    assert sent == []
+    batch_child._end_with_the_parent(9, os.getppid() + 1)
+    assert sent == [9]
+
+
 def test_what_a_killed_run_left_is_cleared(tmp_path: Path) -> None:
     (tmp_path / ".scratch-abc").mkdir()
     (tmp_path / ".map.123.part").mkdir()
@@ -153,11 +167,14 @@ def test_a_cluster_does_the_same(
     assert done[3].report["input"] == str(requests[3].input) and done[1].code == 2
     told = capsys.readouterr().err
     assert "400 of 400, 4 of 4 done" in told and "walk1: walk1 is no recording" in told
+    assert "done again" not in told
     for request in requests:
         assert request.out.is_dir()
 
 
-def test_an_interrupt_reaches_the_workers(dask: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_reaches_the_workers(
+    dask: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(cluster, "Child", FakeChild)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.02)
     monkeypatch.setattr(cluster, "_TOLD_S", 0.05)
@@ -174,6 +191,7 @@ def test_an_interrupt_reaches_the_workers(dask: Any, tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(cluster, "Batch", Interrupted)
     (done,) = cluster.on_cluster(dask.scheduler_address, [Request(tmp_path / "waits", tmp_path / "o")], True)
+    assert "done again" not in capsys.readouterr().err, "although it told of its progress"
     assert done.error == "interrupted after 1 of 4 frames"
 
 
