@@ -72,7 +72,7 @@ def recording_rig(tmp: Path) -> Iterator[tuple[WireRig, Service]]:
 def _records(service: Service) -> bool:
     """Whether photographs are paired, and the recorder says that it writes."""
     state = service.state()
-    if state["phase"] != "recording" or state["pairing"]["cam_0"].get("paired", 0) < 6:
+    if state["phase"] != "recording" or state["pairing"].get("cam_0", {}).get("paired", 0) < 6:
         return False
     return bool(state["session"]["recorder"].get("messages", 0))
 

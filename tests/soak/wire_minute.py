@@ -116,7 +116,10 @@ def play(session: Path, folder: Path, seconds: float, *, mapping: bool) -> dict[
 def _ready(service: Service, *, mapping: bool) -> bool:
     """Recording, photographs are paired, and the kernels of the mapping are compiled."""
     state = service.state()
-    if state["phase"] != "recording" or not state["pairing"]["cam_0"].get("paired", 0):
+    paired = all(counts.get("paired", 0) for counts in state["pairing"].values())
+    if state["phase"] != "recording" or state["windows"] < 5 or not paired:
+        return False
+    if not state["session"]["recorder"].get("messages", 0):
         return False
     return not mapping or (state["session"]["mapping"] or {}).get("frames", 0) > 0
 
