@@ -24,6 +24,8 @@ from artemis_edge.sight import Seen
 
 # Beyond so many sigma_d an observation weighs less than 2 % and is left out: it is of what stands in front
 MOST_SIGMAS = 4.0
+# Observations of every class that a voxel's distribution begins with when a vertex inherits it (Dirichlet prior)
+DOUBT = 0.5
 
 
 def grid_of(scores: DenseScores) -> F32:
@@ -114,8 +116,12 @@ def inherit(store: Store, voxels: I32) -> None:
 
 @kernel
 def start_from(attribute: F32, row: F32) -> None:
-    """Log-probabilities of a voxel's sums, background floored so that no class starts impossible."""
-    floor = np.float32(0.02) * row[WEIGHT]
+    """Log-probabilities of a voxel's sums, floored so that no class starts impossible.
+
+    ``DOUBT`` makes a voxel that few masks have told of say little: the mask of this moment is among them and will be
+    counted for the vertex itself, too.
+    """
+    floor = np.float32(0.02) * row[WEIGHT] + np.float32(DOUBT)
     most = np.float32(0.0)
     for c in range(CLASSES):
         most = max(most, row[c])

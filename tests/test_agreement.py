@@ -8,7 +8,7 @@ import numpy as np
 
 from artemis_edge.block_store import CLASSES
 from artemis_edge.frames import F32, I32, U8
-from artemis_edge.refinement.agreement import RAREST, ROUNDS, TEMPER, agreed
+from artemis_edge.refinement.agreement import PRIOR, RAREST, ROUNDS, TEMPER, agreed
 
 SPACING_M = 0.1
 ACTIVE = np.array([1, 1, 1] + [0] * 13, np.uint8)
@@ -38,7 +38,8 @@ def naive(lam: F32, active: U8, vertices: F32, normals: F32, faces: I32, beta: f
     own = {i: [float(lam[i, c]) for c in slots] for i in known}
     share = np.mean([softmax(own[i]) for i in known], axis=0)
     own = {
-        i: [TEMPER * (v + math.log(max(p, RAREST))) for v, p in zip(own[i], share, strict=True)] for i in own
+        i: [TEMPER * (v + PRIOR * math.log(max(p, RAREST))) for v, p in zip(own[i], share, strict=True)]
+        for i in own
     }
     told = dict(own)
     for _ in range(ROUNDS):

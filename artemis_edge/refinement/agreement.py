@@ -5,7 +5,7 @@ places (``semantic_constraint.py``); when it is finished, by their distributions
 images said against what its neighbours on the same surface are. What images get wrong of one vertex (its pixel
 shows what lies behind a silhouette, a mask was of another class) they seldom get wrong of all its neighbours alike.
 
-    lambda_i <- tau (lambda_i + log pi) + beta sum_j w_ij P_j,    w_ij = max(n_i . n_j, 0)^2 min(r / L_ij, 1)
+    lambda_i <- tau (lambda_i + k log pi) + beta sum_j w_ij P_j,    w_ij = max(n_i . n_j, 0)^2 min(r / L_ij, 1)
 
 pi are the shares of the classes in the map: where a few images contradict each other, it is more likely the wall
 that most of the map is. Edges to another surface (a crease, a border seen as one) weigh little or nothing.
@@ -21,6 +21,8 @@ from artemis_edge.frames import F32, I32, U8
 # tau: of what images say so much counts. Views of a vertex resemble each other and err alike; eq. 12 takes them as
 # independent
 TEMPER = 0.25
+# Exponent of pi: with 1, thin things whose images waver between them and what is behind them give way to that
+PRIOR = 0.5
 # pi of a class that is nearly absent: no class is so rare that a handful of images could not find it
 RAREST = 1e-3
 # Rounds in which classes travel: one edge each
@@ -40,7 +42,8 @@ def agreed(
     if weight == 0.0 or len(known) == 0:
         return out
     own = _normal(lam[np.ix_(known, slots)])
-    own = np.float32(TEMPER) * (own + np.log(np.maximum(_softmax(own).mean(axis=0), np.float32(RAREST))))
+    share = np.maximum(_softmax(own).mean(axis=0), np.float32(RAREST))
+    own = np.float32(TEMPER) * (own + np.float32(PRIOR) * np.log(share))
     graph = np.float32(weight) * neighbours(vertices, normals, faces, known, spacing_m)
     told = own
     for _ in range(ROUNDS):
