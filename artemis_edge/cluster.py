@@ -163,6 +163,11 @@ def _connected(address: str) -> Iterator[Any]:
             f"no Dask scheduler answers at {address}; start one with 'dask scheduler' and workers with "
             f"'dask worker {address}'"
         ) from None
+    except TypeError as error:  # how Dask says that a protocol is not installed or not configured
+        raise InputError(
+            f"--cluster {address}: Dask cannot use this protocol here ({error}); give tcp://HOST:PORT, or configure "
+            "Dask for it"
+        ) from None
     try:
         yield client
     finally:

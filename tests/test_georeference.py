@@ -155,6 +155,14 @@ def test_the_command_writes_report_and_exports(
     assert (out / "w.ply").read_bytes() == (a_map / "mesh.ply").read_bytes()
 
 
+def test_a_map_without_a_report_stays_as_it_was(a_map: Path, tmp_path: Path) -> None:
+    (a_map / "report.html").unlink()
+    control = _csv(tmp_path / "g.csv", _surveyed(WORLD))
+    assert main(["georeference", str(a_map), "--points", str(control), "--epsg", str(EPSG)]) == 2
+    assert read_georeference(a_map / "map") is None
+    assert json.loads((a_map / "report.json").read_text()) == {"frames": 1}
+
+
 def test_normals_turn_with_the_map(a_map: Path, tmp_path: Path) -> None:
     placed = Placed.of(georeference(a_map, _csv(tmp_path / "g.csv", _surveyed(WORLD)), EPSG, 0.05))
     a, b = placed.to_crs(np.array([[10.0, 10, 0], [11.0, 10, 0]]))

@@ -33,11 +33,13 @@ def add(commands: Any) -> None:
 def run_georeference(given: argparse.Namespace) -> int:
     """``artemis-edge georeference``."""
     from artemis_edge.geo.place import georeference, to_json
-    from artemis_edge.geo.report import add_to_report, sentence
+    from artemis_edge.geo.report import add_to_report, read_report, sentence
     from artemis_edge.opened_map import map_folder
 
-    made = georeference(given.map, given.points, given.epsg, given.limit, given.session)
     folder = map_folder(given.map)
+    if folder is not None:
+        read_report(folder.parent)  # before anything is kept
+    made = georeference(given.map, given.points, given.epsg, given.limit, given.session)
     assert folder is not None
     add_to_report(folder.parent, made)
     if given.json:

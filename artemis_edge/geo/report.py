@@ -6,6 +6,7 @@ import json
 import re
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
@@ -16,19 +17,27 @@ _BEGIN, _END = "<!-- georeference -->", "<!-- end of georeference -->"
 
 def add_to_report(folder: Path, made: Georeference) -> None:
     """Into both files of an output directory, in the place of an earlier one; InputError if they are no reports."""
-    try:
-        report = json.loads((folder / "report.json").read_text())
-        page = (folder / "report.html").read_text()
-        report["georeference"] = to_json(made)
-        end = page.rindex("</body>")
-    except (OSError, ValueError, TypeError):
-        raise InputError(f"{folder} has no report of this version; map the recording again") from None
+    report, page = read_report(folder)
+    report["georeference"] = to_json(made)
+    end = page.rindex("</body>")
     write_bytes(folder / "report.json", (json.dumps(report, indent=2, ensure_ascii=False) + "\n").encode())
     if _BEGIN in page:
         page = re.sub(f"{_BEGIN}.*{_END}", lambda _: section(made), page, flags=re.DOTALL)
     else:
         page = f"{page[:end]}{section(made)}\n{page[end:]}"
     write_bytes(folder / "report.html", page.encode())
+
+
+def read_report(folder: Path) -> tuple[dict[str, Any], str]:
+    """Values and page of an output directory's report; InputError if there is none to be added to."""
+    try:
+        report = json.loads((folder / "report.json").read_text("utf-8"))
+        page = (folder / "report.html").read_text("utf-8")
+    except (OSError, ValueError):
+        report, page = None, ""
+    if not isinstance(report, dict) or "</body>" not in page:
+        raise InputError(f"{folder} has no report of this version; map the recording again")
+    return report, page
 
 
 def section(made: Georeference) -> str:

@@ -138,8 +138,18 @@ class WireRig:
         self._photo_ns = np.array([at for at, _, _ in played.photos], np.int64)
 
     def __enter__(self) -> WireRig:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_bytes(self.folder / "rig.toml", settings.to_toml(self.config()).encode())
+        for port in (self.folder / name for name in ("can", "imu")):
+            if port.exists() and not port.is_symlink():
+                raise InputError(
+                    f"{port} is there and is no virtual device; choose another folder with --rig"
+                )
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_bytes(self.folder / "rig.toml", settings.to_toml(self.config()).encode())
+        except OSError as error:
+            raise InputError(
+                f"cannot write to {self.folder}: {error.strerror}; choose another folder with --rig"
+            ) from None
         try:
             self.avia.start()
         except OSError as error:
