@@ -156,7 +156,7 @@ def read_classes(path: Path) -> tuple[str, ...]:
     if text.lstrip().startswith("["):
         try:
             names = json.loads(text)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path} is not a JSON list of names: {error}") from None
     else:
         names = text.splitlines()

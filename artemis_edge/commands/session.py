@@ -140,9 +140,9 @@ def run_trim(given: argparse.Namespace) -> int:
     if not 0.0 <= given.start < given.stop:
         raise InputError(f"--from {given.start:g} --to {given.stop:g}: give 0 <= from < to, in seconds")
     verdicts = verify(source)
-    first = min(verdict.first_ns for verdict in verdicts if verdict.messages or len(verdicts) == 1)
-    start = first + round(given.start * _SECOND_NS)
-    stop = first + round(given.stop * _SECOND_NS) if math.isfinite(given.stop) else 1 << 62
+    first = min((verdict.first_ns for verdict in verdicts if verdict.messages), default=0)
+    start = first + _nanoseconds(given.start)
+    stop = first + _nanoseconds(given.stop)
     if start > max(verdict.last_ns for verdict in verdicts):
         raise InputError(f"--from {given.start:g}: {source} is shorter than that")
     if source.is_file():
@@ -156,6 +156,11 @@ def run_trim(given: argparse.Namespace) -> int:
     else:
         print(f"{given.out}: {sum(report.messages for report in reports)} messages")
     return DONE
+
+
+def _nanoseconds(seconds: float) -> int:
+    """Seconds of any size, infinite ones too, as an integer beyond which no recording goes."""
+    return round(min(seconds * _SECOND_NS, float(1 << 62)))
 
 
 def _copied(report: Any) -> dict[str, Any]:

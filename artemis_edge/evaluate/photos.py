@@ -52,7 +52,7 @@ def _entries(path: Path) -> list[Any]:
         content = json.loads(path.read_text())
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise InputError(f"{path} is not JSON; `reprocess --holdout N` writes PHOTOS.json") from None
     entries = content.get("photos") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:
