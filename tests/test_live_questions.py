@@ -230,9 +230,9 @@ def test_questions_take_slots_and_give_them_back() -> None:
     assert Asked.decode(__import__("json").dumps(desk.asked().plain())) == desk.asked()
 
 
-@pytest.mark.parametrize("text", ["", "   ", None, 5, ["car"], "car " * LONGEST])
+@pytest.mark.parametrize("text", ["", "   ", None, 5, ["car"], "car " * LONGEST, "a \ud800 tree"])
 def test_what_is_no_question_is_refused_with_a_sentence(text: object) -> None:
-    with pytest.raises(InputError, match=r"write what to look for|at most 500"):
+    with pytest.raises(InputError, match=r"write what to look for|at most 500|half a character"):
         Desk(MODEL).ask(text)
 
 

@@ -49,6 +49,7 @@ _MAPPER_STALE_S = 20.0  # it may be in a long frame, and saving a large map it s
 _SAVING_S = 30.0  # what is asked of systemd again and again while saving
 _DRAIN_S = 12.0
 _MARK_LONGEST = 500
+_NAME_LONGEST, _NAME_BYTES = 100, 240  # a file system takes 255 bytes
 _BUTTON_RECORD, _BUTTON_MARK = 0, 1
 _NS = 1e9
 
@@ -452,15 +453,27 @@ class Daemon:
         if self.phase != Phase.IDLE:
             raise InputError(f"the service is {self.phase}: wait until it is idle")
         name = request.get("name")
-        if name is not None and (
-            not isinstance(name, str) or not name or Path(name).name != name or len(name) > 100
-        ):
-            raise InputError("the name of a session is a plain name of up to 100 characters, without folders")
+        if name is not None and not _plain_name(name):
+            raise InputError(
+                f"the name of a session is a plain name of up to {_NAME_LONGEST} characters ({_NAME_BYTES} bytes), "
+                "without folders and control characters"
+            )
         folder = None if name is None else Path(self.config.service.sessions) / name
         if folder is not None and folder.exists():
             raise InputError(f"{folder} is there already; give another name")
         self._begin_checking(folder)
         return {"phase": str(self.phase)}
+
+
+def _plain_name(name: object) -> bool:
+    """Whether a folder can be called so on every file system: neither control characters nor half characters."""
+    return (
+        isinstance(name, str)
+        and name.isprintable()
+        and 0 < len(name) <= _NAME_LONGEST
+        and len(name.encode()) <= _NAME_BYTES
+        and Path(name).name == name
+    )
 
 
 def make_desk(config: RunConfig) -> Desk | None:
