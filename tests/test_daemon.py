@@ -19,6 +19,7 @@ from artemis_edge.service.daemon import Daemon
 from artemis_edge.service.lights import BUZZER, LED, MARKED, Phase
 from artemis_edge.service.settings import RunConfig, ServiceSettings
 from artemis_edge.session.feed import messages
+from tests.livox_ports import reserved
 
 _PATIENCE_S = 90.0
 
@@ -40,6 +41,14 @@ class Turned:
         self.service.rig.start()
         self.service.capture.start()
 
+    def end(self) -> None:
+        """Whatever the test has come to."""
+        self.service._signals = 1
+        try:
+            assert self.service._stop() == 0
+        finally:
+            self.service.control.close()
+
     def until(self, true: Callable[[], bool]) -> bool:
         end = time.monotonic() + _PATIENCE_S
         while not true() and time.monotonic() < end:
@@ -49,10 +58,12 @@ class Turned:
 
 @pytest.fixture
 def board(tmp_path: Path) -> Iterator[WireTrigger]:
+    """And nobody else at the LiDAR's ports, which the service opens."""
     wire = WireTrigger(tmp_path / "can")
-    wire.start()
-    yield wire
-    wire.stop()
+    with reserved():
+        wire.start()
+        yield wire
+        wire.stop()
 
 
 def test_buttons_lights_and_marks(board: WireTrigger, tmp_path: Path) -> None:
@@ -73,10 +84,10 @@ def test_buttons_lights_and_marks(board: WireTrigger, tmp_path: Path) -> None:
         press(0)
         assert turned.until(lambda: service.phase == Phase.RECORDING)
         assert turned.until(lambda: firmware.led == LED[Phase.RECORDING])
-        assert firmware.buzzer == BUZZER[Phase.RECORDING]
+        assert turned.until(lambda: firmware.buzzer == BUZZER[Phase.RECORDING])
         end = time.monotonic() + 0.3
         press(1)
-        assert turned.until(lambda: firmware.buzzer == MARKED) and firmware.led == LED[Phase.RECORDING]
+        assert turned.until(lambda: firmware.buzzer == MARKED and firmware.led == LED[Phase.RECORDING])
         firmware.led = 0  # as after a restart of the board
         firmware._tell_health = True
         assert turned.until(lambda: firmware.led == LED[Phase.RECORDING]), "told again"
@@ -90,9 +101,7 @@ def test_buttons_lights_and_marks(board: WireTrigger, tmp_path: Path) -> None:
         assert sum(b'"mark"' in event for event in events) == 1
         assert any(b'"button"' in event for event in events)
     finally:
-        service._signals = 1
-        assert service._stop() == 0
-        service.control.close()
+        turned.end()
     assert firmware.led == 0, "nobody is there any more"
 
 

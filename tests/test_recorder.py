@@ -77,7 +77,12 @@ def test_another_recorder_goes_on_where_a_killed_one_ends(tmp_path: Path) -> Non
     publish(ring, sent(3, topic=TF_STATIC.name))
     for k in range(4, 200):
         publish(ring, sent(k))
-    assert until(lambda: bool(first.hear()) and first.latest.get("messages", 0) == 197, 90.0)
+
+    def all_written() -> bool:
+        first.hear()
+        return int(first.latest.get("messages", 0)) == 197
+
+    assert until(all_written, 90.0)
     assert until(lambda: GrowingFile(tmp_path / "session_000.mcap").latest_number() >= 0, 90.0)
     first.process.kill()
     first.end(20.0)
