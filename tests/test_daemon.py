@@ -20,6 +20,7 @@ from artemis_edge.service.lights import BUZZER, LED, MARKED, Phase
 from artemis_edge.service.settings import RunConfig, ServiceSettings
 from artemis_edge.session.feed import messages
 from tests.livox_ports import reserved
+from tests.waiting import until
 
 _PATIENCE_S = 90.0
 
@@ -84,10 +85,10 @@ def test_buttons_lights_and_marks(board: WireTrigger, tmp_path: Path) -> None:
         press(0)
         assert turned.until(lambda: service.phase == Phase.RECORDING)
         assert turned.until(lambda: firmware.led == LED[Phase.RECORDING])
-        assert turned.until(lambda: firmware.buzzer == BUZZER[Phase.RECORDING])
+        assert turned.until(lambda: firmware.sounded == [BUZZER[Phase.RECORDING]])
         end = time.monotonic() + 0.3
         press(1)
-        assert turned.until(lambda: firmware.buzzer == MARKED and firmware.led == LED[Phase.RECORDING])
+        assert turned.until(lambda: MARKED in firmware.sounded) and firmware.led == LED[Phase.RECORDING]
         firmware.led = 0  # as after a restart of the board
         firmware._tell_health = True
         assert turned.until(lambda: firmware.led == LED[Phase.RECORDING]), "told again"
@@ -102,7 +103,7 @@ def test_buttons_lights_and_marks(board: WireTrigger, tmp_path: Path) -> None:
         assert any(b'"button"' in event for event in events)
     finally:
         turned.end()
-    assert firmware.led == 0, "nobody is there any more"
+    assert until(lambda: firmware.led == 0), "nobody is there any more"
 
 
 class _Stage:

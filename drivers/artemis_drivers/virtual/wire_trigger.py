@@ -89,6 +89,7 @@ class Firmware:
         self.run_state = RunState.IDLE
         self.node_state = NodeState.PRE_OPERATIONAL
         self.led = self.buzzer = self.buttons = 0
+        self.sounded: list[int] = []  # patterns of the buzzer so far
         self.pps_connected = True
         self.boot_ns = 0
         self._strobe = strobe_us
@@ -200,6 +201,7 @@ class Firmware:
         elif command.opcode == Opcode.STOP:
             self.run_state, self._next_trigger = RunState.IDLE, None
         self.led, self.buzzer = command.led & 0xF, command.led >> 4
+        self.sounded += [self.buzzer] if self.buzzer else []
         self._tell_health = True
 
     def _read(self, index: int, subindex: int) -> tuple[int, int]:
