@@ -8,6 +8,7 @@ them under one path: a shared folder.
 from __future__ import annotations
 
 import contextlib
+import gc
 import signal
 import time
 import uuid
@@ -151,13 +152,25 @@ def _text(task: Task) -> str:
 
 
 @contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """A client that could not connect must not be collected while another starts: it would wait for its lock."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+@contextlib.contextmanager
 def _connected(address: str) -> Iterator[Any]:
     try:
         from distributed import Client
     except ImportError:
         raise InputError("--cluster needs the extra 'cluster': pip install 'artemis-edge[cluster]'") from None
     try:
-        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+        with _no_collection():
+            client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError):
         raise InputError(
             f"no Dask scheduler answers at {address}; start one with 'dask scheduler' and workers with "
