@@ -7,8 +7,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import json
 import os
 import shutil
@@ -17,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from pathlib import Path
 from typing import IO, Any
 
@@ -26,10 +23,11 @@ from msgspec import Struct
 
 from artemis_edge.config import from_toml, to_toml
 from artemis_edge.errors import InputError, RunError, UserError
+from artemis_edge.orphans import end_with_the_parent
+from artemis_edge.progress import now_and_then
 from artemis_edge.runtime import Request, reprocess
 
 _SAY_S = 1.0
-_PR_SET_PDEATHSIG = 1
 _LEFT_OVER = (".scratch-*", ".*.part", ".*.old")
 
 
@@ -145,20 +143,11 @@ def _ended(code: int, last: str) -> str:
 def main(arguments: list[str]) -> int:
     """The child."""
     task = msgspec.json.decode(arguments[0], type=Task)
-    _end_with_the_parent(task.orphaned, int(arguments[1]))
+    end_with_the_parent(task.orphaned, int(arguments[1]))
     request = task.request()
     _clear(request.out)
-    last = 0.0
-
-    def report(done: int, total: int, note: str = "") -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= _SAY_S or done == total:
-            last = now
-            _say({"done": done, "total": total, "note": note})
-
     try:
-        outcome = reprocess(request, report)
+        outcome = reprocess(request, now_and_then(_say_progress, _SAY_S))
     except UserError as error:
         _say({"error": str(error), "code": error.exit_code})
         return error.exit_code
@@ -167,6 +156,10 @@ def main(arguments: list[str]) -> int:
         return 1
     _say({"report": outcome.report, "warnings": outcome.warnings})
     return 0
+
+
+def _say_progress(done: int, total: int, note: str = "") -> None:
+    _say({"done": done, "total": total, "note": note})
 
 
 def _say(value: dict[str, Any]) -> None:
@@ -181,13 +174,6 @@ def _clear(out: Path) -> None:
                 shutil.rmtree(path, ignore_errors=True)
             else:
                 path.unlink(missing_ok=True)
-
-
-def _end_with_the_parent(number: int, parent: int) -> None:
-    with contextlib.suppress(OSError, AttributeError):  # Linux only; elsewhere it goes on to its end
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
-    if os.getppid() != parent:  # it died while this one began
-        os.kill(os.getpid(), number)
 
 
 if __name__ == "__main__":

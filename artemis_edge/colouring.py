@@ -64,7 +64,7 @@ def sees(points: F32, T_cam_world: F64, lens: Lens, nearest: F32) -> F64:
 def coloured_points(folder: Path, report: Report = silent) -> KeptPoints | None:
     """The points of a map's folder, coloured with the images kept there the first time that they are asked for.
 
-    None where it keeps no points; without images no point has a colour. InputError if the file is damaged, OSError
+    None where it keeps no points; without images no point has a colour. InputError if the file is damaged, RunError
     where the folder cannot be written.
     """
     kept = open_points(folder)

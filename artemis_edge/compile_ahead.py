@@ -49,9 +49,14 @@ class Compilation:
         for child in self._children:
             child.join()
         if all(child.exitcode == 0 for child in self._children):
-            with contextlib.suppress(OSError):
-                self._marker.parent.mkdir(parents=True, exist_ok=True)
-                self._marker.touch()
+            leave(self._marker)
+
+
+def leave(marker: Path) -> None:
+    """Remember that something was compiled; where that cannot be written, it is compiled again another time."""
+    with contextlib.suppress(OSError):
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
 
 
 def compile_ahead(request: Request, source: FrameSource, span: range) -> None:
@@ -61,16 +66,11 @@ def compile_ahead(request: Request, source: FrameSource, span: range) -> None:
 
 def begin(request: Request, source: FrameSource, span: range) -> Compilation:
     """As :func:`compile_ahead`, in the background."""
-    own = estimates(request, source)
+    own = request.estimates(source)
     marker = cache_dir() / f"compiled-{_kind(request, source, span, own)}"
     parts = () if marker.exists() else (MAP, ODOMETRY) if own else (MAP,)
     make = multiprocessing.get_context("spawn").Process
     return Compilation([make(target=_compile, args=(request, part), daemon=True) for part in parts], marker)
-
-
-def estimates(request: Request, source: FrameSource) -> bool:
-    """Whether the poses are those of our own odometry."""
-    return request.own_odometry or (request.poses is None and source.poses is None)
 
 
 def _kind(request: Request, source: FrameSource, span: range, own: bool) -> str:
@@ -106,7 +106,7 @@ def _compile(request: Request, part: str) -> None:
         if part == ODOMETRY:
             _track(odometry(), source, span)
         else:
-            _map(request, _still(source) if estimates(request, source) else odometry, source, span)
+            _map(request, _still(source) if request.estimates(source) else odometry, source, span)
     except UserError:  # which the run itself will meet and tell
         sys.exit(1)
 

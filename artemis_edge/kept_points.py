@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from artemis_edge.errors import InputError
+from artemis_edge.export.atomic import replacing
 from artemis_edge.export.mesh import finite_rows
 from artemis_edge.frames import F32, F64
 
@@ -142,16 +143,14 @@ class KeptPoints:
                 yield _read_rows(file, min(_ROWS_AT_ONCE, self.rows - start))
 
     def with_colours(self, rows: Iterator[Rows]) -> KeptPoints:
-        """The file replaced by one of all ``rows``, in order, with their colours; all or nothing."""
-        part = self.path.with_name(f".{self.path.name}.part")
-        try:
-            with part.open("wb") as file:
-                file.write(_HEADER.pack(_COLOURED, self.rows, self.zero_ns, self.stride))
-                for some in rows:
-                    file.write(some.tobytes())
-            part.replace(self.path)
-        finally:
-            part.unlink(missing_ok=True)
+        """The file replaced by one of all ``rows``, in order, with their colours; all or nothing.
+
+        Raises RunError where it cannot be written.
+        """
+        with replacing(self.path) as file:
+            file.write(_HEADER.pack(_COLOURED, self.rows, self.zero_ns, self.stride))
+            for some in rows:
+                file.write(some.tobytes())
         return replace(self, coloured=True)
 
 

@@ -16,13 +16,13 @@ import numpy as np
 
 from artemis_edge import health
 from artemis_edge.errors import InputError, RunError, UserError
+from artemis_edge.export.atomic import disk_sentence
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F32, F64, FrameSource, MeshDelta, SyncedFrame, TrackedFrame, Trajectory
+from artemis_edge.load import Load
 from artemis_edge.paging import Page
 from artemis_edge.progress import Report, say
 from artemis_edge.refinement.photographs import Waiting
-from artemis_edge.session.load import Load
-from artemis_edge.session.results import disk_sentence
 from artemis_edge.session.statistics import RunStatistics
 
 Publish = Callable[[MeshDelta], None]

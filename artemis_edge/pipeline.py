@@ -15,6 +15,7 @@ from artemis_edge.delta import Outbox
 from artemis_edge.export.atlas import write_atlas
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
+from artemis_edge.load import Load
 from artemis_edge.map_writer import save_map, write_mesh, write_removed
 from artemis_edge.mesher import Mesher
 from artemis_edge.paging import TIGHT, Page, Pager, with_attributes
@@ -22,7 +23,6 @@ from artemis_edge.refinement.photographs import Waiting
 from artemis_edge.refinement.stage import Refinement
 from artemis_edge.semantic_constraint import SemanticConstraint
 from artemis_edge.semantic_map import Segmenter, SemanticMap
-from artemis_edge.session.load import Load
 from artemis_edge.visibility import FreeSpace
 from artemis_edge.voxel_map import VoxelMap
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -43,17 +44,24 @@ def progress(label: str, plain: bool = False) -> Iterator[Report]:
         yield report
 
 
-def _lines(label: str) -> Report:
-    last = time.monotonic()
+def now_and_then(report: Report, every_s: float, last_s: float = -math.inf) -> Report:
+    """``report`` called at most every ``every_s`` from ``last_s`` (monotonic) on, and whenever all is done."""
 
-    def report(done: int, total: int, note: str = "") -> None:
-        nonlocal last
+    def seldom(done: int, total: int, note: str = "") -> None:
+        nonlocal last_s
         now = time.monotonic()
-        if now - last >= _LINE_EVERY_S or done == total:
-            last = now
-            say(f"{label}: {done} of {total}{', ' if note else ''}{note}")
+        if now - last_s >= every_s or done == total:
+            last_s = now
+            report(done, total, note)
 
-    return report
+    return seldom
+
+
+def _lines(label: str) -> Report:
+    def line(done: int, total: int, note: str = "") -> None:
+        say(f"{label}: {done} of {total}{', ' if note else ''}{note}")
+
+    return now_and_then(line, _LINE_EVERY_S, time.monotonic())
 
 
 @contextmanager
@@ -71,13 +79,8 @@ def _bar(label: str) -> Iterator[Report]:
     # No refresh of its own: a thread that draws would be counted in the CPU time of the frames.
     with Progress(*columns, console=Console(stderr=True), auto_refresh=False) as bar:
         task = bar.add_task(label, total=None, note="")
-        last = 0.0
 
-        def report(done: int, total: int, note: str = "") -> None:
-            nonlocal last
-            now = time.monotonic()
-            if now - last >= _BAR_EVERY_S or done == total:
-                last = now
-                bar.update(task, completed=done, total=total, note=note, refresh=True)
+        def draw(done: int, total: int, note: str = "") -> None:
+            bar.update(task, completed=done, total=total, note=note, refresh=True)
 
-        yield report
+        yield now_and_then(draw, _BAR_EVERY_S)

@@ -73,6 +73,10 @@ class Request:
     model: str = ""
     go_on: Path | None = None
 
+    def estimates(self, source: FrameSource) -> bool:
+        """Whether the poses are those of our own odometry: none are given with it or by the input."""
+        return self.poses is None and (self.own_odometry or source.poses is None or not len(source.poses))
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -241,7 +245,7 @@ def placed(
     found = find_start(earlier, odometry, _frames(source, span), source.name)
     statistics.continued = earlier.account(found, int(source.stamp_ns[span.start]))
     start = earlier.start(found)
-    if isinstance(odometry(), OwnOdometry):
+    if request.estimates(source):
         return lambda: own_odometry(request.config.odometry, lambda: _frames(source, span), start)
     fixed = Trajectory(np.zeros(1, np.int64), found.T_map_world[None])
     return lambda: CorrectedOdometry(odometry(), fixed)
@@ -257,10 +261,10 @@ def choose_odometry(source: FrameSource, request: Request, span: range) -> Calla
         hole = None if len(given) == len(source.stamp_ns) else hole_sentence(given, poses.stamp_ns)
         source.warnings.extend([] if hole is None else [f"{request.poses}: {hole}"])
         return lambda: chosen
-    if source.poses is not None and len(source.poses) and not request.own_odometry:
-        own = GivenPoses(source.poses)
-        return lambda: own
-    return lambda: own_odometry(request.config.odometry, lambda: _frames(source, span))
+    if request.estimates(source) or source.poses is None:
+        return lambda: own_odometry(request.config.odometry, lambda: _frames(source, span))
+    own = GivenPoses(source.poses)
+    return lambda: own
 
 
 def own_odometry(
@@ -354,7 +358,7 @@ def write_results(
     stage: Callable[[str], None] = unheard,
 ) -> dict[str, Any] | None:
     """All results, small ones first; returns the report. ``stage`` is told what comes next."""
-    results.attempt("trajectory.tum", lambda path: _write_tum(path, trajectory))
+    results.attempt("trajectory.tum", lambda path: write_tum(path, trajectory))
     results.text("config.toml", statistics.config_toml)
     results.json("objects.json", {"objects": []})
     photos.remove_earlier()
@@ -386,15 +390,6 @@ def write_results(
             path.parent, whole, trajectory, statistics, queries_json(replies), evaluation
         ),
     )
-
-
-def _write_tum(path: Path, trajectory: Trajectory) -> None:
-    part = path.with_name(f".{path.name}.part")
-    try:
-        write_tum(part, trajectory)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _nothing_mapped(run: MappingRun, source: FrameSource, span: range) -> InputError | RunError:

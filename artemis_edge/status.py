@@ -5,10 +5,18 @@ Fields that are not known are left at their defaults; whoever shows them says "n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from msgspec import Struct
 
+Colour = tuple[int, int, int]  # red, green, blue, 0..255
+
+#: Of questions, in the order in which they are given away.
+_COLOURS: tuple[Colour, ...] = (
+    (255, 120, 0), (0, 220, 120), (230, 60, 230), (70, 160, 255), (250, 230, 60), (255, 70, 70), (0, 210, 210),
+    (170, 110, 255), (190, 220, 90), (255, 150, 180),
+)  # fmt: skip
 State = Literal["idle", "checking", "recording", "saving", "fault", "replaying", "done"]
 
 
@@ -35,7 +43,7 @@ class QueryStatus(Struct, frozen=True):
     status: str = "searching"
     count: int = 0
     score: float = 0.0
-    colour: tuple[int, int, int] = (255, 200, 0)
+    colour: Colour = (255, 200, 0)
     note: str = ""
     places: list[tuple[float, float, float]] = []
     labels: list[int] = []
@@ -86,3 +94,9 @@ class Status(Struct, frozen=True):
     yaw: float = 0.0
     profile: str = ""
     report: str = ""
+
+
+def next_colour(used: Sequence[Colour]) -> Colour:
+    """For one more question: the first that no other has; where all are taken, in turn."""
+    free = (colour for colour in _COLOURS if colour not in used)
+    return next(free, _COLOURS[len(used) % len(_COLOURS)])

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from artemis_edge.errors import InputError
+from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F64, I64, Bool, Trajectory
 
 _COLUMNS = 8
@@ -126,13 +127,13 @@ def parse_seconds(text: str) -> int:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write poses as TUM lines: stamps to the nanosecond, positions to the micrometre."""
+    """Write poses as TUM lines: stamps to the nanosecond, positions to the micrometre. Raises RunError."""
     quaternions = quaternion_from_matrix(trajectory.T_world_lidar)
     lines = []
     for stamp, T, q in zip(trajectory.stamp_ns.tolist(), trajectory.T_world_lidar, quaternions, strict=True):
         values = " ".join(f"{v:.6f}" for v in T[:3, 3]) + " " + " ".join(f"{v:.9f}" for v in q)
         lines.append(f"{seconds_text(stamp)} {values}\n")
-    path.write_text("".join(lines))
+    write_bytes(path, "".join(lines).encode())
 
 
 def seconds_text(stamp_ns: int) -> str:

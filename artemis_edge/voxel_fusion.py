@@ -17,7 +17,6 @@ import numpy as np
 
 from artemis_edge._jit import kernel
 from artemis_edge.block_store import CLASSES, LOG_CLASS, WEIGHT, Store
-from artemis_edge.class_rows import is_blank
 from artemis_edge.frames import F32, I32, U8
 from artemis_edge.segmentation.backend import FULL_SCORE, DenseScores
 from artemis_edge.sight import Seen
@@ -99,19 +98,6 @@ def distribution(row: F32, active: U8, out: F32) -> bool:
     for c in range(CLASSES):
         out[c] = row[c] / total if active[c] and total > 0.0 else np.float32(0.0)
     return bool(total > 0.0)
-
-
-@kernel
-def inherit(store: Store, voxels: I32) -> None:
-    """Vertices that nobody has looked at yet take the distribution of their voxel, as logarithms (eq. 12's start)."""
-    for v in voxels:
-        row = store.voxel_class[v]
-        if row[WEIGHT] <= 0.0:
-            continue
-        for c in range(64):
-            s = store.voxel_cell[v, c]
-            if s >= 0 and is_blank(store.attribute[s]):
-                start_from(store.attribute[s], row)
 
 
 @kernel

@@ -10,7 +10,7 @@ import pytest
 
 from artemis_edge.export.ply import Mesh, bare_mesh, write_ply
 from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
-from artemis_edge.session.load import Load
+from artemis_edge.load import Load
 
 
 class FakeMapper:

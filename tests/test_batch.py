@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from artemis_edge import batch, batch_child, cluster
+from artemis_edge import batch, batch_child, cluster, orphans
 from artemis_edge.batch_child import Child, Done, Task
 from artemis_edge.cli import main
 from artemis_edge.config import load
@@ -127,11 +127,11 @@ def test_a_process_whose_parent_died_while_it_began_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[int] = []
-    monkeypatch.setattr(batch_child.os, "kill", lambda pid, number: sent.append(number))
-    monkeypatch.setattr(batch_child.ctypes, "CDLL", lambda _: SimpleNamespace(prctl=lambda *_: 0))
-    batch_child._end_with_the_parent(9, os.getppid())
+    monkeypatch.setattr(orphans.os, "kill", lambda pid, number: sent.append(number))
+    monkeypatch.setattr(orphans.ctypes, "CDLL", lambda _: SimpleNamespace(prctl=lambda *_: 0))
+    orphans.end_with_the_parent(9, os.getppid())
     assert sent == []
-    batch_child._end_with_the_parent(9, os.getppid() + 1)
+    orphans.end_with_the_parent(9, os.getppid() + 1)
     assert sent == [9]
 
 

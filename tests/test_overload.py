@@ -11,9 +11,9 @@ import pytest
 from artemis_edge import health, topics
 from artemis_edge.config import Config
 from artemis_edge.frames import LidarScan, SyncedFrame
+from artemis_edge.load import LADDER, SAVING, Load
 from artemis_edge.service.overload import Machine, OverloadControl, Readings
 from artemis_edge.session.feed import LiveFeed
-from artemis_edge.session.load import LADDER, SAVING, Load
 from artemis_edge.session.message_ring import MessageRing, Sent
 from artemis_edge.session.messages import Text
 from artemis_edge.session.stream_mapping import StreamMapping, thinned

@@ -6,8 +6,6 @@ import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,49 +32,10 @@ from tests.control_client import ask
 from tests.listening import listening
 from tests.livox_ports import reserved
 from tests.waiting import until
+from tests.wire_service import Service
 
 _PATIENCE_S = 300.0
 _PICTURES = topics.CAMERA_IMAGE.name
-
-
-class _Service:
-    """The command in a process of its own, and what it says to a socket in systemd's place."""
-
-    def __init__(self, rig: WireRig, session: Path, tmp: Path) -> None:
-        self.path = rig.folder / "control"
-        self.notified: list[str] = []
-        self._notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._notify.bind(str(tmp / "notify"))
-        self._notify.setblocking(False)
-        self.log = (tmp / "log").open("w+")
-        words = ["run", "--config", str(rig.folder / "rig.toml"), "--session", str(session)]
-        environment = {"NOTIFY_SOCKET": str(tmp / "notify"), "WATCHDOG_USEC": "2000000"}
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "artemis_edge.cli", *words],
-            env={**os.environ, **environment},
-            stderr=self.log,
-        )
-
-    def state(self) -> dict[str, Any]:
-        self.heard()
-        return dict(ask(self.path, do="state")["result"])
-
-    def listens(self) -> bool:
-        return "READY=1" in self.heard() and self.process.poll() is None
-
-    def heard(self) -> list[str]:
-        try:
-            while True:
-                self.notified.append(self._notify.recv(4096).decode())
-        except BlockingIOError:
-            return self.notified
-
-    def end(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-        self.log.close()
-        self._notify.close()
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +53,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def played(
     model: None, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[Path, _Service, dict[str, Any]]]:
+) -> Iterator[tuple[Path, Service, dict[str, Any]]]:
     """One run for all: a walk of two seconds, the mapping killed in the middle of it."""
     tmp = tmp_path_factory.mktemp("run")
     red_and_green = np.zeros((48, 64, 3), np.uint8)  # BGR
@@ -106,10 +65,10 @@ def played(
     )  # nobody waits for compilers with a patience of its own
     with reserved(), WireRig(walk, tmp / "rig") as rig:
         _keep_few_images(rig.folder / "rig.toml")
-        service = _Service(rig, session, tmp)
+        service = Service(rig, session, tmp)
         try:
-            assert until(service.listens, _PATIENCE_S, 0.2), _log(service)
-            assert until(lambda: _mapped(service) > 3, _PATIENCE_S, 0.2), _log(service)
+            assert until(service.listens, _PATIENCE_S, 0.2), service.said()
+            assert until(lambda: _mapped(service) > 3, _PATIENCE_S, 0.2), service.said()
             seen["status"] = ask(service.path, do="status")["result"]
             seen["listening"] = listening(service.process.pid)
             ask(service.path, do="mark", text="here")
@@ -137,7 +96,7 @@ def played(
             service.end()
 
 
-def test_nothing_listens_on_the_network(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+def test_nothing_listens_on_the_network(played: tuple[Path, Service, dict[str, Any]]) -> None:
     """Datagrams of the devices come in; but nobody can connect."""
     _, _, seen = played
     assert seen["listening"] == []
@@ -145,7 +104,7 @@ def test_nothing_listens_on_the_network(played: tuple[Path, _Service, dict[str, 
         assert len(listening(os.getpid())) >= 1, server
 
 
-def _mapped(service: _Service) -> int:
+def _mapped(service: Service) -> int:
     state = service.state()
     return int(((state["session"] or {}).get("mapping") or {}).get("frames", 0))
 
@@ -157,19 +116,13 @@ def _keep_few_images(rig: Path) -> None:
     rig.write_text(text.replace("images = 300", "images = 8"))
 
 
-def _found(service: _Service) -> dict[str, Any]:
+def _found(service: Service) -> dict[str, Any]:
     return {query["text"]: query for query in ask(service.path, do="queries")["result"]["queries"]}
 
 
-def _log(service: _Service) -> str:
-    service.log.flush()
-    service.log.seek(0)
-    return service.log.read()
-
-
-def test_it_ends_well_and_tells_systemd(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+def test_it_ends_well_and_tells_systemd(played: tuple[Path, Service, dict[str, Any]]) -> None:
     _, service, seen = played
-    assert seen["code"] == 0, _log(service)
+    assert seen["code"] == 0, service.said()
     said = service.heard()
     assert said[0] == "READY=1" and "STOPPING=1" in said
     assert said.count("WATCHDOG=1") > 2 and any(line.startswith("EXTEND_TIMEOUT") for line in said)
@@ -178,7 +131,7 @@ def test_it_ends_well_and_tells_systemd(played: tuple[Path, _Service, dict[str, 
 
 
 def test_nothing_recorded_is_lost_by_the_death_of_the_mapping(
-    played: tuple[Path, _Service, dict[str, Any]],
+    played: tuple[Path, Service, dict[str, Any]],
 ) -> None:
     session, _, seen = played
     assert [verdict.problems for verdict in verify(session)] == [[]]
@@ -194,7 +147,7 @@ def test_nothing_recorded_is_lost_by_the_death_of_the_mapping(
     assert seen["state"]["session"]["mapping"]["missed"] == 0
 
 
-def test_replay_equals_live(played: tuple[Path, _Service, dict[str, Any]], tmp_path: Path) -> None:
+def test_replay_equals_live(played: tuple[Path, Service, dict[str, Any]], tmp_path: Path) -> None:
     """Byte for byte, although the live mapping died in the middle."""
     session, _, _ = played
     replay(session, tmp_path / "replayed")
@@ -203,7 +156,7 @@ def test_replay_equals_live(played: tuple[Path, _Service, dict[str, Any]], tmp_p
         assert live.read_bytes() == again.read_bytes(), name
 
 
-def test_questions_come_and_go_while_it_scans(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+def test_questions_come_and_go_while_it_scans(played: tuple[Path, Service, dict[str, Any]]) -> None:
     session, _, seen = played
     car, person, giraffe, empty = seen["asked"]
     assert (car["result"]["status"], person["result"]["status"]) == ("searching", "searching")
@@ -219,7 +172,7 @@ def test_questions_come_and_go_while_it_scans(played: tuple[Path, _Service, dict
     assert (mesh.labels > 0).any() and mesh.label_names[int(mesh.labels.max())] == "person"
 
 
-def test_the_session_holds_what_it_should(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+def test_the_session_holds_what_it_should(played: tuple[Path, Service, dict[str, Any]]) -> None:
     session, _, _ = played
     (verdict,) = verify(session)
     expected = [topics.LIDAR_POINTS, topics.IMU, topics.CAMERA_STAMP, topics.CLOCKS]
@@ -231,7 +184,7 @@ def test_the_session_holds_what_it_should(played: tuple[Path, _Service, dict[str
     assert any(b"mapping_restarted" in message.data for message in events)
 
 
-def test_other_libraries_read_it(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+def test_other_libraries_read_it(played: tuple[Path, Service, dict[str, Any]]) -> None:
     session, _, _ = played
     (verdict,) = verify(session)
     with AnyReader([session / "session_000.mcap"]) as bag:
@@ -250,7 +203,7 @@ def test_other_libraries_read_it(played: tuple[Path, _Service, dict[str, Any]]) 
     assert len(decoded) == verdict.messages
 
 
-def test_clients_see_everything(played: tuple[Path, _Service, dict[str, Any]]) -> None:
+def test_clients_see_everything(played: tuple[Path, Service, dict[str, Any]]) -> None:
     _, _, seen = played
     status = seen["status"]
     assert status["state"] == "recording" and status["frames"] > 3

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from artemis_edge._jit import njit
-from artemis_edge.calibrate.photometric import PARAMETERS, Normal, View, motion_columns
+from artemis_edge.calibrate.photometric import PARAMETERS, Normal, View, in_sensors, motion_columns
 from artemis_edge.frames import F32, F64, I64, U8
 
 _NEAREST_M, _FARTHEST_M = 0.5, 30.0
@@ -109,18 +109,12 @@ def attract(
     """
     size = PARAMETERS + 2
     H, g, cost, count = np.zeros((size, size)), np.zeros(size), 0.0, 0
-    M, C, K = view.T_lidar_world, T_cam_lidar, view.K
+    K = view.K
     J = np.empty(size)
     margin = reach_px + _BORDER_PX
     steps = int(reach_px / _STEP_PX)
     for n in range(len(points)):
-        p = points[n]
-        lx = M[0, 0] * p[0] + M[0, 1] * p[1] + M[0, 2] * p[2] + M[0, 3]
-        ly = M[1, 0] * p[0] + M[1, 1] * p[1] + M[1, 2] * p[2] + M[1, 3]
-        lz = M[2, 0] * p[0] + M[2, 1] * p[1] + M[2, 2] * p[2] + M[2, 3]
-        x = C[0, 0] * lx + C[0, 1] * ly + C[0, 2] * lz + C[0, 3]
-        y = C[1, 0] * lx + C[1, 1] * ly + C[1, 2] * lz + C[1, 3]
-        z = C[2, 0] * lx + C[2, 1] * ly + C[2, 2] * lz + C[2, 3]
+        lx, ly, lz, x, y, z = in_sensors(view, T_cam_lidar, points[n])
         if not z > _NEAREST_M:
             continue
         u, v = K[0] * x / z + K[2], K[1] * y / z + K[3]
@@ -137,7 +131,7 @@ def attract(
         if best < _LEAST_GRADIENT or best < 2.0 * mean or abs(at) > (steps - 0.5) * _STEP_PX:
             continue
         e = -at  # the silhouette should move by ``at`` across
-        motion = motion_columns(C, view.twist, lx, ly, lz, x, y, z)
+        motion = motion_columns(T_cam_lidar, view.twist, lx, ly, lz, x, y, z)
         for k in range(PARAMETERS):
             du = K[0] * (motion[0, k] - x / z * motion[2, k]) / z
             dv = K[1] * (motion[1, k] - y / z * motion[2, k]) / z

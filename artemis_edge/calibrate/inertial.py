@@ -30,13 +30,12 @@ class ImuFit(NamedTuple):
     """``rotation`` (3,) rotation vector and ``time_offset_s`` as of ``mounts.ImuMount``, the gyroscope's ``bias``.
 
     ``position`` (3,) is where the IMU is in the LiDAR frame, m, or None if the motion does not tell;
-    ``sigma_rad``, ``sigma_s`` and ``position_sigma_m`` (3,) are one deviation; ``rms_rad`` the residual of attitudes.
+    ``sigma_rad``, ``sigma_s`` and ``position_sigma_m`` (3,) are one deviation.
     """
 
     rotation: F64
     time_offset_s: float
     bias: F64
-    rms_rad: float
     sigma_rad: float
     sigma_s: float
     position: F64 | None
@@ -71,7 +70,6 @@ def fit_imu(poses: Trajectory, imu: ImuSamples) -> ImuFit | None:
         found.x[:3],
         float(found.x[6]),
         found.x[3:6],
-        float(np.sqrt(np.mean(fit.residuals(found.x) ** 2))),
         float(sigma[:3].max()),
         float(sigma[6]),
         position if position_sigma.max() < _MOST_LEVER_SIGMA_M else None,

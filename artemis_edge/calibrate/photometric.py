@@ -63,6 +63,19 @@ def motion_columns(C: F64, w: F64, lx: float, ly: float, lz: float, x: float, y:
 
 
 @njit
+def in_sensors(view: View, T_cam_lidar: F64, point: F64) -> tuple[float, float, float, float, float, float]:
+    """A point of the world (its first three numbers) as seen from the LiDAR, x y z, and from the camera, x y z."""
+    M, C = view.T_lidar_world, T_cam_lidar
+    lx = M[0, 0] * point[0] + M[0, 1] * point[1] + M[0, 2] * point[2] + M[0, 3]
+    ly = M[1, 0] * point[0] + M[1, 1] * point[1] + M[1, 2] * point[2] + M[1, 3]
+    lz = M[2, 0] * point[0] + M[2, 1] * point[1] + M[2, 2] * point[2] + M[2, 3]
+    x = C[0, 0] * lx + C[0, 1] * ly + C[0, 2] * lz + C[0, 3]
+    y = C[1, 0] * lx + C[1, 1] * ly + C[1, 2] * lz + C[1, 3]
+    z = C[2, 0] * lx + C[2, 1] * ly + C[2, 2] * lz + C[2, 3]
+    return lx, ly, lz, x, y, z
+
+
+@njit
 def _look(view: View, T_cam_lidar: F64, anchor: F64, value: F64, B: F64) -> bool:
     """Grey values (7, 7) of a patch in a view, and how the unknowns move the patch over its surface.
 
@@ -70,12 +83,7 @@ def _look(view: View, T_cam_lidar: F64, anchor: F64, value: F64, B: F64) -> bool
     outside of the photograph.
     """
     M, C, w = view.T_lidar_world, T_cam_lidar, view.twist
-    lx = M[0, 0] * anchor[0] + M[0, 1] * anchor[1] + M[0, 2] * anchor[2] + M[0, 3]
-    ly = M[1, 0] * anchor[0] + M[1, 1] * anchor[1] + M[1, 2] * anchor[2] + M[1, 3]
-    lz = M[2, 0] * anchor[0] + M[2, 1] * anchor[1] + M[2, 2] * anchor[2] + M[2, 3]
-    x = C[0, 0] * lx + C[0, 1] * ly + C[0, 2] * lz + C[0, 3]
-    y = C[1, 0] * lx + C[1, 1] * ly + C[1, 2] * lz + C[1, 3]
-    z = C[2, 0] * lx + C[2, 1] * ly + C[2, 2] * lz + C[2, 3]
+    lx, ly, lz, x, y, z = in_sensors(view, T_cam_lidar, anchor)
     if not z > _NEAREST_M:
         return False
     step = np.empty((3, 2))  # of the grid, in the camera

@@ -25,11 +25,14 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
-        raise RunError(
-            f"cannot write {path}: {error.strerror or error}; free space or choose another place"
-        ) from None
+        raise RunError(disk_sentence(path, error)) from None
     finally:
         part.unlink(missing_ok=True)
+
+
+def disk_sentence(place: Path, error: OSError) -> str:
+    """Why something could not be written, and what to do."""
+    return f"cannot write {place}: {error.strerror or error}; free space or choose another place"
 
 
 def write_bytes(path: Path, content: bytes) -> None:

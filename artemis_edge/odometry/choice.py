@@ -16,7 +16,7 @@ from artemis_edge.odometry.known_map import Start
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.odometry.propagation import HOLE_S
 
-_LOOKED_AT = 2  # frames
+LOOKED_AT = 2  # frames
 _LEAST_SAMPLES = 5  # in those frames
 
 #: An odometry of either kind: both have ``lost``, counts by reason.
@@ -33,7 +33,7 @@ def odometry_for(
 
     With a ``start`` it goes on in a known map.
     """
-    first = list(islice(frames(), _LOOKED_AT))
+    first = list(islice(frames(), LOOKED_AT))
     if all(fast_enough(frame.imu) for frame in first) and first:
         return InertialOdometry.looking_ahead(config, first, images, start)
     return LidarOdometry.looking_ahead(config, first, start)

@@ -43,8 +43,6 @@ from artemis_edge.refinement.visible import NEAR_M, Visible, facing
 
 # Triangles are widened by so many texels: none falls between two of them, and hardly any is painted twice
 WIDEN = 0.02
-# A chart serves triangles up to 60 degrees off its direction: their texels are stretched by two at most
-FACES = 0.5
 _CLEARLY = 0.8  # cosine from which a direction is preferred to one that has a chart but serves only just
 _BARELY = 0.6
 

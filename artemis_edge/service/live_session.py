@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import ctypes
 import os
 import time
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from typing import Any
 from artemis_edge import config as mapping_config
 from artemis_edge import topics
 from artemis_edge.errors import InputError
+from artemis_edge.orphans import adopt_orphans
 from artemis_edge.service import settings
 from artemis_edge.service.children import Child
 from artemis_edge.service.control import control_path, viewers_path
@@ -34,7 +34,6 @@ _MOST_RESTARTS = 5
 _MAPPING_NICE = 5  # capture and recording go first
 _SEGMENTER_NICE = 10  # it may have what the mapping leaves: late by design
 _JUDGE_S = 0.25
-_PR_SET_CHILD_SUBREAPER = 36
 
 #: Told of what happened: an event for the session, the log and the clients.
 Tell = Callable[[dict[str, Any]], None]
@@ -84,7 +83,7 @@ class LiveSession:
             raise InputError(
                 f"cannot make the session {self.folder}: {error.strerror}; choose another --session"
             ) from None
-        _adopt_orphans()
+        adopt_orphans()
         self._out = result_folder(self.folder)
         self._first = self.outlet.open(
             self.config, self._about, None if self.asked is None else self.asked.plain()
@@ -331,7 +330,3 @@ def session_folder(sessions: Path, now: datetime) -> Path:
     while folder.exists():
         folder, number = sessions / f"{stem}_{number}", number + 1
     return folder
-
-
-def _adopt_orphans() -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)

@@ -6,8 +6,6 @@ When it dies, its last checkpoint goes on (checkpoint.py), and maps again what c
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import gc
 import os
 import signal
@@ -27,6 +25,7 @@ from artemis_edge.config import Config, from_toml
 from artemis_edge.continuing import find_earlier
 from artemis_edge.errors import UserError
 from artemis_edge.loop.relocate import Found
+from artemis_edge.orphans import end_with_the_parent
 from artemis_edge.service.checkpoint import Checkpoints
 from artemis_edge.service.map_feed import MapFeed
 from artemis_edge.session.feed import LiveFeed
@@ -42,7 +41,6 @@ _SAY_S = 0.25
 _COLLECT_EVERY = 100  # frames
 _LATEST = 50  # frames that times are told of
 _EARLY = 300  # frames after which it is too late to hold still at the start
-_PR_SET_PDEATHSIG = 1
 
 
 class MapperTask(Struct, frozen=True):
@@ -234,12 +232,6 @@ def _call(mapper: object, name: str) -> None:
         method()
 
 
-def _end_with_the_service() -> None:
-    """Also a copy of this process ends when the service does."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
 def _work(task: MapperTask, ring: MessageRing, channel: LineChannel) -> None:
     out = Path(task.out)
     prepare(out)
@@ -268,7 +260,7 @@ def _told(saved: dict[str, Any]) -> dict[str, Any]:
 def main(arguments: list[str]) -> int:
     """``mapper.py RING SOCKET TASK``: file descriptors of the ring and the socket, and the task as JSON."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with_the_service()
+    end_with_the_parent(signal.SIGTERM)
     cv2.setNumThreads(1)  # a pool of threads would not survive a fork
     ring, sock, text = int(arguments[0]), int(arguments[1]), arguments[2]
     task, channel = msgspec.json.decode(text, type=MapperTask), LineChannel(socket.socket(fileno=sock))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from msgspec.structs import replace
 
 from artemis_edge import health
-from artemis_edge.session.load import LADDER, SAVING, Load
+from artemis_edge.load import LADDER, SAVING, Load
 
 _BEHIND_S = 1.0  # the mapping is too slow
 _LEVEL_S = 0.4  # it keeps up: a frame, and what waits for it

@@ -14,20 +14,16 @@ from artemis_edge.segmentation.manifest import Manifest
 from artemis_edge.segmentation.query import Phrase
 from artemis_edge.segmentation.resolve import SlotTable, Understanding, understand
 from artemis_edge.session.asked import Asked
-from artemis_edge.status import QueryStatus
+from artemis_edge.status import Colour, QueryStatus, next_colour
 
 MOST_QUESTIONS = 32
 LONGEST = 500  # characters
-_COLOURS = (
-    (255, 120, 0), (0, 220, 120), (230, 60, 230), (70, 160, 255), (250, 230, 60), (255, 70, 70), (0, 210, 210),
-    (170, 110, 255), (190, 220, 90), (255, 150, 180),
-)  # fmt: skip
 
 
 @dataclass(slots=True)
 class _Question:
     understanding: Understanding
-    colour: tuple[int, int, int]
+    colour: Colour
 
 
 @dataclass(slots=True)
@@ -57,7 +53,8 @@ class Desk:
                 raise InputError(f"{MOST_QUESTIONS} questions are asked already; remove one")
             found = understand(text, Knowledge(self.model))
             self._slots.acquire(found.classes)
-            self._asked[text] = _Question(found, self._colour())
+            colour = next_colour([question.colour for question in self._asked.values()])
+            self._asked[text] = _Question(found, colour)
         return self._status(text, {})
 
     def forget(self, text: object) -> None:
@@ -107,10 +104,6 @@ class Desk:
         names = [name for noun in targets if noun in found.nouns for name in found.nouns[noun].classes]
         slots = self._slots.names()
         return [slot for slot, name in slots.items() if name in names] or list(slots)
-
-    def _colour(self) -> tuple[int, int, int]:
-        used = {question.colour for question in self._asked.values()}
-        return next((c for c in _COLOURS if c not in used), _COLOURS[len(self._asked) % len(_COLOURS)])
 
 
 def needs_choice(found: Understanding) -> bool:

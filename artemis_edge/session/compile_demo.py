@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from artemis_edge._jit import cache_dir
-from artemis_edge.compile_ahead import begin
+from artemis_edge.compile_ahead import begin, leave
 from artemis_edge.datasets import open_input
 from artemis_edge.progress import say
 from artemis_edge.runtime import Request
@@ -35,4 +35,4 @@ def compiling(request: Request, world: str, seed: int, settings: Mapping[str, st
         if compilation.working():
             say("compiling for this machine (once; a minute or two)")
         compilation.wait()
-    marker.touch()
+    leave(marker)

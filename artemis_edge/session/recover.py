@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
@@ -15,6 +12,7 @@ from mcap.writer import CompressionType, Writer
 from artemis_edge import topics
 from artemis_edge.datasets.bag import ros2_type
 from artemis_edge.errors import InputError, RunError
+from artemis_edge.export.atomic import disk_sentence, replacing
 from artemis_edge.session.mcap_file import McapFile
 from artemis_edge.session.writer import CHUNK_BYTES
 
@@ -60,14 +58,15 @@ def copied(source: Path, copy: Path, wanted: Callable[[Message], bool]) -> Copie
     declared = _declarations(file)
     report = Copied(source, copy)
     try:
-        with _replacing(copy) as stream:
-            writer = Writer(stream, CHUNK_BYTES, CompressionType.LZ4)
-            writer.start("ros2", "artemis-edge")
-            again = McapFile(source)
-            _copy(again, writer, declared, wanted, report)
-            writer.finish()
+        copy.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunError(f"cannot write {copy}: {error.strerror}; free space or choose another place") from None
+        raise RunError(disk_sentence(copy, error)) from None
+    with replacing(copy) as stream:
+        writer = Writer(stream, CHUNK_BYTES, CompressionType.LZ4)
+        writer.start("ros2", "artemis-edge")
+        again = McapFile(source)
+        _copy(again, writer, declared, wanted, report)
+        writer.finish()
     report.finished, report.chunks, report.torn_bytes = file.finished, file.chunks, file.torn_bytes
     report.damaged = file.damaged
     return report
@@ -135,18 +134,3 @@ def _add(writer: Writer, channel: int, message: Message, report: Copied) -> None
     report.first_ns = message.log_time if report.messages == 0 else min(report.first_ns, message.log_time)
     report.last_ns = max(report.last_ns, message.log_time)
     report.messages += 1
-
-
-@contextlib.contextmanager
-def _replacing(path: Path) -> Iterator[IO[bytes]]:
-    """A file that has its name only once it is complete and on the disk."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from artemis_edge.errors import InputError, RunError
-from artemis_edge.export.atomic import write_bytes
+from artemis_edge.export.atomic import disk_sentence, write_bytes
 
 _T = TypeVar("_T")
 
@@ -55,11 +55,6 @@ class Results:
 
     def _failed(self, sentence: str) -> None:
         self.fault = self.fault or sentence
-
-
-def disk_sentence(place: Path, error: OSError) -> str:
-    """Why something could not be written, and what to do."""
-    return f"cannot write {place}: {error.strerror or error}; free space or choose another place"
 
 
 def prepare(folder: Path) -> None:

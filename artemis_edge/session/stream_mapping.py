@@ -23,6 +23,7 @@ from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import MeshDelta, SyncedFrame, Trajectory
 from artemis_edge.highlight import Reply, answer, objects_of
 from artemis_edge.keeper import Keeper
+from artemis_edge.load import Load
 from artemis_edge.loop.relocate import Found
 from artemis_edge.map_size import MapSize
 from artemis_edge.mapping_run import Mapper
@@ -32,8 +33,7 @@ from artemis_edge.segmentation.backend import DenseScores, Grid
 from artemis_edge.session.asked import Asked
 from artemis_edge.session.assembly import FrameAssembler
 from artemis_edge.session.late_masks import LateMasks, pack
-from artemis_edge.session.late_odometry import LOOKED_AT, LateOdometry
-from artemis_edge.session.load import Load
+from artemis_edge.session.late_odometry import LateOdometry
 from artemis_edge.session.message_ring import Sent
 from artemis_edge.session.messages import (
     CameraInfo,
@@ -85,7 +85,6 @@ class StreamMapping:
         self.statistics = RunStatistics(name, _INPUT_HZ, config_toml=to_toml(config))
         self.load = Load()
         self.skip: set[int] = set()
-        self._first: list[SyncedFrame] | None = []  # until the odometry is chosen
         self.latest_ns = 0
         self.fault = ""
         self.delta: MeshDelta | None = None  # of the latest frame
@@ -110,7 +109,7 @@ class StreamMapping:
         if frame is None:
             return False
         self.latest_ns = frame.stamp_ns
-        for ready in self._ready(self._zones.applied(frame)):
+        for ready in self.odometry.ready(self._zones.applied(frame)):
             self._one(ready)
         return True
 
@@ -137,9 +136,8 @@ class StreamMapping:
     def save(self, out: Path) -> dict[str, Any]:
         """Finish the map and write all results to ``out``; returns what report.json holds. Raises RunError."""
         prepare(out)
-        if self._first is not None:  # the stream was too short to choose
-            for frame in self._begin():
-                self._one(frame)
+        for frame in self.odometry.release():
+            self._one(frame)
         if not self.mapper.trajectory:
             raise RunError("no frame of a LiDAR could be mapped; what was recorded is kept")
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
@@ -168,19 +166,6 @@ class StreamMapping:
         stamps = np.array([stamp for stamp, _ in poses], np.int64)
         return Trajectory(stamps, np.array([T for _, T in poses], np.float64).reshape(-1, 4, 4))
 
-    def _ready(self, frame: SyncedFrame) -> list[SyncedFrame]:
-        """Frames that can be mapped now: the first ones wait for each other."""
-        if self._first is None:
-            return [frame]
-        self._first.append(frame)
-        return self._begin() if len(self._first) == LOOKED_AT else []
-
-    def _begin(self) -> list[SyncedFrame]:
-        """Choose the odometry by the first frames; returns them."""
-        first, self._first = self._first or [], None
-        self.odometry.choose(first)
-        return first
-
     def _one(self, frame: SyncedFrame) -> None:
         self.before(frame.index)
         if frame.index in self.skip:
@@ -196,8 +181,8 @@ class StreamMapping:
         frame = self._prepare(thinned(frame, self.load.every_point))
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
         self.delta = self.mapper.process(frame)
-        self.size.add(self.delta)
         wall, cpu = time.perf_counter_ns() - wall, time.process_time_ns() - cpu
+        self.size.add(self.delta)
         self.statistics.add_frame(wall / _NS_PER_MS, cpu / _NS_PER_MS, self.mapper.stage_ms)
         self.statistics.add_lost(frame.lost)
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from artemis_edge.config import Config
 from artemis_edge.continuing import EarlierMap
 from artemis_edge.errors import InputError
-from artemis_edge.frames import SyncedFrame
 from artemis_edge.loop.recognition import Recognition
 from artemis_edge.loop.relocate import Found, Search
 from artemis_edge.session.assembly import FrameAssembler
-from artemis_edge.session.late_odometry import LOOKED_AT, LateOdometry
+from artemis_edge.session.late_odometry import LateOdometry
 from artemis_edge.session.message_ring import Sent
 
 _PATIENCE_S = 60.0  # after which the stream is mapped on its own
@@ -25,7 +24,6 @@ class StreamSearch:
         self._assembler = FrameAssembler()
         self._odometry = LateOdometry(config.odometry)
         self._search = Search(Recognition(earlier.vertices))
-        self._first: list[SyncedFrame] | None = []
 
     def take(self, sent: Sent) -> Found | None:
         """Where the stream's own world lies, once a message completed the frame that shows it."""
@@ -34,7 +32,7 @@ class StreamSearch:
             return None
         if self.first_ns is None:
             self.first_ns = frame.stamp_ns
-        for ready in self._ready(frame):
+        for ready in self._odometry.ready(frame):
             try:
                 found = self._search.add(self._odometry.track(ready))
             except InputError:
@@ -53,14 +51,3 @@ class StreamSearch:
         if self.given_up:
             return f"{self.earlier.unknown('the place')}; it is mapped on its own"
         return f"looking for the place in {self.earlier.root}: look at walls and corners that the map shows"
-
-    def _ready(self, frame: SyncedFrame) -> list[SyncedFrame]:
-        """Frames that can be tracked now: the first ones wait for each other."""
-        if self._first is None:
-            return [frame]
-        self._first.append(frame)
-        if len(self._first) < LOOKED_AT:
-            return []
-        first, self._first = self._first, None
-        self._odometry.choose(first)
-        return first

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from artemis_edge.errors import InputError
-from artemis_edge.export.ply import Mesh, read_mesh, read_points
+from artemis_edge.export.ply import Mesh, read_points
 from artemis_edge.frames import F32, F64, I32, U8, Bool
 from artemis_edge.session.truth_files import REFERENCE_POINT
 from artemis_edge.session.winding import NEAR_M, Verdict, near, verdicts
@@ -118,15 +118,6 @@ def evaluate_against_world(
         ghost_area_share=_share(ghosts, area.sum()),
         triangles=len(corners),
         area_m2=float(area.sum()),
-    )
-
-
-def evaluate_files(mesh: Path, truth: Path) -> TruthReport:
-    """Judge the mesh in a PLY file by a session's ``truth/`` folder; raises InputError as the readers do."""
-    reference = truth / "reference.ply"
-    observed = read_reference(reference) if reference.exists() else None
-    return evaluate_against_world(
-        read_mesh(mesh), read_mesh(truth / "mesh.ply"), observed, read_moving(truth)
     )
 
 

@@ -205,10 +205,6 @@ class WireRig:
             self._sequence, self._camera_boot_ns = 0, time.monotonic_ns()
             self.camera.plug()
 
-    def truth_of(self, stamp_ns: int) -> int | None:
-        """When something of the session happens, by the monotonic clock; None before ``begin``."""
-        return None if self.start_ns is None else self.start_ns + stamp_ns - self.played.start_ns
-
     def config(self) -> RunConfig:
         """Settings of ``run`` for these devices."""
         played, imu = self.played, None

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 from artemis_edge.segmentation.registry import open_by_name
 from artemis_edge.segmentation.resolve import understand
-from artemis_edge.status import QueryStatus
+from artemis_edge.status import QueryStatus, next_colour
 
 #: What the shipped network can tell apart well enough to be asked for.
 EVERY_CLASS = ("car", "person", "bench", "tree", "building", "bicycle", "pole", "sign")
-_COLOURS = ((255, 120, 0), (0, 220, 120), (230, 60, 230), (70, 160, 255), (250, 230, 60), (255, 70, 70))
 
 
 class LiveQuestions:
@@ -32,8 +31,7 @@ class LiveQuestions:
         return list(self._asked.values())
 
     def _understood(self, text: str) -> QueryStatus:
-        used = {q.colour for q in self._asked.values()}
-        colour = next((c for c in _COLOURS if c not in used), _COLOURS[len(used) % len(_COLOURS)])
+        colour = next_colour([question.colour for question in self._asked.values()])
         found = understand(text, open_by_name())
         labels = [self._slot[name] for name in found.classes if name in self._slot]
         if not labels:
