@@ -182,7 +182,7 @@ def _refresh_cell(store: Store, v: int, i: int, stamp: int, rules: RefreshRules,
     p[POSITION + 1] += store.voxel[v, IY] * edge_m
     p[POSITION + 2] += store.voxel[v, IZ] * edge_m
     apart = rules.min_distance_m
-    if state[s] == ALIVE and _is_crowded(store, w.grid, w.slot, code, s, STAYS * apart):
+    if state[s] == ALIVE and _is_crowded(store, w, i, STAYS * apart):
         state[s] = EVIDENCE_ONLY
         _tell_neighbours(store, w.neighbour, code, AT_ONCE, stamp)
     elif (
@@ -384,22 +384,26 @@ def is_seen_through(e: F32) -> bool:
 
 
 @kernel
-def _is_crowded(store: Store, grid: I32, slot: I32, at: int, s: int, distance: float) -> bool:
-    """Whether a living vertex with more evidence is nearer than ``distance``."""
-    p, mine = store.vertex[s], store.evidence[s, COUNT]
+def _is_crowded(store: Store, w: RefreshSpace, own: int, distance: float) -> bool:
+    """Whether a living vertex with more evidence is nearer to that of the gathered cell ``own`` than ``distance``."""
+    at, s, mine = w.code[own], w.slot[own], w.moment[own, 0]
+    p = store.vertex[s]
     for dx in range(-1, 2):
         for dy in range(-1, 2):
             for dz in range(-1, 2):
-                i = grid[at + (dx << 10) + (dy << 5) + dz]
-                if i < 0 or slot[i] == s or store.state[slot[i]] != ALIVE:
+                i = w.grid[at + (dx << 10) + (dy << 5) + dz]
+                if i < 0 or i == own:
                     continue
-                theirs = store.evidence[slot[i], COUNT]
-                if theirs < mine or (theirs == mine and slot[i] > s):
-                    continue
-                q = store.vertex[slot[i]]
+                other = w.slot[i]
+                q = store.vertex[other]
+                # the rarest first: the processor guesses it right
                 near = (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2 < distance * distance
+                if not near or store.state[other] != ALIVE or w.moment[i, 0] < mine:
+                    continue
+                if w.moment[i, 0] == mine and other > s:
+                    continue
                 # where two objects meet, their vertices may
-                if near and not are_two_objects(store.attribute[s], store.attribute[slot[i]]):
+                if not are_two_objects(store.attribute[s], store.attribute[other]):
                     return True
     return False
 

@@ -1,5 +1,6 @@
 """The project as a package and as a repository: what is shipped, what must not be, and what is documented."""
 
+import os
 import re
 import subprocess
 import sys
@@ -74,6 +75,16 @@ def test_constraints_cover_what_is_required() -> None:
     required = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
     names = {Requirement(text).name.lower().replace("_", "-") for text in required}
     assert names - pinned == {"artemis-edge"}
+
+
+def test_matrices_are_multiplied_by_one_thread_unless_the_user_says_otherwise() -> None:
+    told = "import os, artemis_edge; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    for given, wanted in (({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")):
+        rest = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
+        said = subprocess.run(
+            [sys.executable, "-c", told], env=rest | given, capture_output=True, text=True, check=True
+        )
+        assert said.stdout.strip() == wanted
 
 
 def test_the_command_is_installed() -> None:
