@@ -298,12 +298,11 @@ def run_demo(given: argparse.Namespace) -> int:
 def run_simulate(given: argparse.Namespace) -> int:
     """``artemis-edge simulate``."""
     from artemis_edge.progress import progress, say
-    from artemis_edge.session.results import prepare
+    from artemis_edge.session.results import preparing
     from artemis_edge.session.simulate import simulate
 
     settings = dict(_key_value(text) for text in given.sets)
-    prepare(given.out)
-    with progress("simulating") as report:
+    with preparing(given.out), progress("simulating") as report:
         made = simulate(given.world, given.seed, given.seconds, given.lidar, given.out, settings, report)
     for note in made.notes:
         say(f"note: {note}")

@@ -24,7 +24,7 @@ from artemis_edge.batch_child import Child, Done, Task
 from artemis_edge.errors import InputError
 from artemis_edge.progress import progress, say
 from artemis_edge.runtime import Request
-from artemis_edge.session.results import prepare
+from artemis_edge.session.results import prepare, remove_empty
 
 _CONNECT_S = 10.0
 _LOOK_S = 0.5
@@ -33,20 +33,29 @@ _TOLD_S = 1.0
 
 def on_cluster(address: str, requests: Sequence[Request], plain: bool) -> list[Done]:
     """How each request ended, in their order. Raises InputError where the cluster cannot do them at all."""
-    for request in requests:
-        prepare(request.out)
-    with _connected(address) as client:
-        _require_workers(client, address, requests)
-        batch = Batch(client, requests)
-        with progress(f"mapping {len(requests)} recordings on the cluster", plain) as report:
-            while not batch.over:
-                try:
-                    batch.look()
-                    report(*overall(batch.shares))
-                    time.sleep(_LOOK_S)
-                except KeyboardInterrupt:
-                    batch.stop()
-        return batch.results
+    made = {request.out: prepare(request.out) for request in requests}
+    try:
+        with _connected(address) as client:
+            _require_workers(client, address, requests)
+            done = _all_done(Batch(client, requests), plain)
+        for request, ended in zip(requests, done, strict=True):
+            if not ended.error:
+                del made[request.out]
+        return done
+    finally:
+        remove_empty(folder for folders in made.values() for folder in folders)
+
+
+def _all_done(batch: Batch, plain: bool) -> list[Done]:
+    with progress(f"mapping {len(batch.shares)} recordings on the cluster", plain) as report:
+        while not batch.over:
+            try:
+                batch.look()
+                report(*overall(batch.shares))
+                time.sleep(_LOOK_S)
+            except KeyboardInterrupt:
+                batch.stop()
+    return batch.results
 
 
 class Batch:
@@ -189,7 +198,8 @@ def _connected(address: str) -> Iterator[Any]:
 
 def _require_workers(client: Any, address: str, requests: Sequence[Request]) -> None:
     """Some workers, with this version of the program, that see the same folders."""
-    paths = sorted({str(path.resolve()) for r in requests for path in (r.input, r.out)})
+    needed = (path for r in requests for path in (r.input, r.out, r.poses, r.go_on) if path is not None)
+    paths = sorted({str(path.resolve()) for path in needed})
     if not client.scheduler_info()["workers"]:
         raise InputError(f"the cluster at {address} has no workers; start some with 'dask worker {address}'")
     try:

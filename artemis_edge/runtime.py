@@ -39,7 +39,7 @@ from artemis_edge.segmentation.yolo_seg import Thresholds
 from artemis_edge.semantic_map import Segmenter
 from artemis_edge.session.photos import INDEX, HeldOut
 from artemis_edge.session.report import Evaluation, RunStatistics, write_report
-from artemis_edge.session.results import Results, prepare, scratch
+from artemis_edge.session.results import Results, preparing, scratch
 from artemis_edge.telling import telling
 from artemis_edge.trajectory import hole_sentence, pose_per_frame, read_tum, write_tum
 
@@ -121,9 +121,8 @@ def reprocess(
     span = frame_span(source, request)
     odometry = choose_odometry(source, request, span)
     earlier = None if request.go_on is None else open_earlier(request.go_on, request.config)
-    prepare(request.out)
     statistics = RunStatistics(source.name, source.input_hz, config_toml=to_toml(request.config))
-    with scratch(request.out) as pages, Answering(request) as answering:
+    with preparing(request.out), scratch(request.out) as pages, Answering(request) as answering:
         with Interrupt() as interrupt, telling(request.config.view) as live:
             warm_up_run(request, odometry, pages, source, span, statistics, make)
             if earlier is not None:

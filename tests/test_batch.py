@@ -168,8 +168,7 @@ def test_a_cluster_does_the_same(
     told = capsys.readouterr().err
     assert "400 of 400, 4 of 4 done" in told and "walk1: walk1 is no recording" in told
     assert "done again" not in told
-    for request in requests:
-        assert request.out.is_dir()
+    assert [request.out.is_dir() for request in requests] == [True, False, True, True]
 
 
 def test_an_interrupt_reaches_the_workers(
@@ -205,6 +204,11 @@ def test_what_is_wrong_with_a_cluster(dask: Any, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(cluster, "_CONNECT_S", 10.0)
     with pytest.raises(InputError, match=r"does not see .*missing; give paths"):
         cluster.on_cluster(dask.scheduler_address, [Request(tmp_path / "missing", tmp_path / "o")], True)
+    for name in ("poses", "go_on"):
+        here = Request(requests[0].input, tmp_path / "o" / "deep", **{name: tmp_path / "absent"})
+        with pytest.raises(InputError, match=r"does not see .*absent; give paths"):
+            cluster.on_cluster(dask.scheduler_address, [here], True)
+    assert not (tmp_path / "o").exists(), "nothing is left of what was prepared"
     monkeypatch.setattr(cluster, "_look", lambda paths: ("0.0.1", []))
     with pytest.raises(InputError, match=r"has artemis-edge 0\.0\.1, this is"):
         cluster.on_cluster(dask.scheduler_address, requests, True)

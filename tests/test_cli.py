@@ -203,6 +203,31 @@ def test_session_info_of_a_data_set(kitti: Path, capsys: pytest.CaptureFixture[s
     assert "10 LiDAR frames" in told
 
 
+@pytest.mark.parametrize(
+    ("words", "instead"),
+    [(["tui"], "'artemis-edge view'"), (["demo", "--tui", "--out", "made"], "leave --tui out")],
+)
+def test_without_a_terminal_it_is_said_what_else_there_is(
+    words: list[str],
+    instead: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "needs a terminal" in said and instead in said and ("--tui" in said) == ("--tui" in words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_world_that_is_not_there_leaves_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", "atlantis", "--out", str(tmp_path / "a" / "b")]) == 2
+    assert "atlantis" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 def test_simulate_writes_a_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "walk"
     arguments = ["simulate", "street", "--seconds", "0.3", "--out", str(out), "--set", "density=0.05"]

@@ -32,6 +32,7 @@ def run_attach(given: argparse.Namespace) -> int:
     from artemis_edge.service.control import default_path
     from artemis_edge.tui.socket_remote import SocketRemote
 
+    _require_terminal("'artemis-edge view' shows the map in a browser, programs ask the control socket")
     run_app(SocketRemote(given.socket or default_path()), Path())
     return DONE
 
@@ -41,13 +42,15 @@ def run_app(remote: Remote, sessions: Path) -> None:
     from artemis_edge.tui.app import ArtemisTui
     from artemis_edge.tui.history import History, history_file
 
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        remote.close()
-        raise InputError("the terminal application needs a terminal; leave --tui out, or use --json commands")
     try:
         ArtemisTui(remote, sessions, _has_colour(), read_keys(keys_file()), History(history_file())).run()
     finally:
         remote.close()
+
+
+def _require_terminal(instead: str) -> None:
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise InputError(f"the terminal application needs a terminal; {instead}")
 
 
 def keys_file() -> Path:
@@ -81,6 +84,7 @@ def run_demo(given: argparse.Namespace, seed: int) -> int:
     from artemis_edge.session.results import prepare
     from artemis_edge.tui.child import DemoRemote
 
+    _require_terminal("leave --tui out")
     prepare(given.out)
     remote = DemoRemote(
         given.world, given.seconds, seed, given.out, list(getattr(given, "query", None) or [])

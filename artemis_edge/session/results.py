@@ -6,8 +6,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,8 +57,12 @@ class Results:
         self.fault = self.fault or sentence
 
 
-def prepare(folder: Path) -> None:
-    """Create ``folder`` (and those above it) for results if it is not there; InputError if it cannot be one."""
+def prepare(folder: Path) -> list[Path]:
+    """Create ``folder`` (and those above it) for results if it is not there; returns the folders that were made.
+
+    Raises InputError if it cannot be one.
+    """
+    made = [above for above in (folder, *folder.parents) if not above.exists()]
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; --out needs a folder")
     try:
@@ -67,6 +71,25 @@ def prepare(folder: Path) -> None:
             pass
     except OSError as error:
         raise InputError(f"cannot write to {folder}: {error.strerror}; choose another --out") from None
+    return made
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Those of ``folders`` that hold nothing, the innermost first."""
+    for folder in sorted(folders, key=lambda path: len(path.parts), reverse=True):
+        with suppress(OSError):
+            folder.rmdir()
+
+
+@contextmanager
+def preparing(folder: Path) -> Iterator[None]:
+    """As ``prepare``; where an error leaves nothing in it, what was made is gone again."""
+    made = prepare(folder)
+    try:
+        yield
+    except BaseException:
+        remove_empty(made)
+        raise
 
 
 @contextmanager

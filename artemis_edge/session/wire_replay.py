@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,7 @@ def _mounts(played: Played, assembler: FrameAssembler, lidar_frame: str, imu_fra
 
 
 class WireRig:
-    """The devices in ``folder``: ``rig.toml`` there is the file for ``run --config``.
+    """The devices in ``folder``: ``rig.toml`` there is the file for ``run --config``. One of others is not replaced.
 
     ``begin`` starts the session ``lead_s`` after it was called; ``over`` is set when all was played.
     """
@@ -145,7 +146,7 @@ class WireRig:
                 )
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_bytes(self.folder / "rig.toml", settings.to_toml(self.config()).encode())
+            _write_rig(self.folder / "rig.toml", settings.to_toml(self.config()).encode())
         except OSError as error:
             raise InputError(
                 f"cannot write to {self.folder}: {error.strerror}; choose another folder with --rig"
@@ -292,6 +293,23 @@ class WireRig:
             time.sleep(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9))
             if self.camera is not None and self.camera.put(frame):
                 self.counts["photos"] += 1
+
+
+def _write_rig(path: Path, content: bytes) -> None:
+    """The file for ``run``, which says what it held when it was written: one that somebody changed is not replaced."""
+    if path.exists():
+        first, _, rest = path.read_bytes().partition(b"\n")
+        if first != _signed(rest):
+            raise InputError(
+                f"{path} was not written by replay --wire, or was changed since; choose another folder with --rig"
+            )
+    write_bytes(path, _signed(content) + b"\n" + content)
+
+
+def _signed(content: bytes) -> bytes:
+    return (
+        f"# by replay --wire, which replaces it unless it was changed: {sha256(content).hexdigest()}".encode()
+    )
 
 
 def _placed(window: PointCloud2) -> tuple[Any, Any, Any]:
