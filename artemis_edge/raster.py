@@ -7,14 +7,16 @@ in an orthographic view. On equal nearness the triangle drawn first stays.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from artemis_edge._jit import njit
-from artemis_edge.frames import F32, F64, I32
+from artemis_edge.frames import F32, F64, I32, U8
 
 NOTHING = -1  # of the triangle buffer
+_LEAST_LENGTH = 1e-6  # of a normal
 _NEAR_CORNERS = 4  # a triangle cut by the near plane has at most four
 
 
@@ -178,6 +180,98 @@ def corner_weights(
     if total > 0.0:
         return wa / total, wb / total, wc / total
     return 1.0, 0.0, 0.0  # seen exactly edge-on
+
+
+class Looks(NamedTuple):
+    """Colours uint8 (n, 3) and normals float32 (n, 3), of any length, of vertices."""
+
+    colours: U8
+    normals: F32
+
+
+class Lamp(NamedTuple):
+    """Light from a unit ``direction`` (3,) beside that from everywhere, ``ambient`` 0..1; the ``paper`` behind."""
+
+    direction: F64
+    ambient: float
+    paper: U8
+
+
+@njit
+def brightness(lamp: Lamp, x: float, y: float, z: float) -> float:
+    """Of a matt surface with this normal, 0..1; either side of it counts."""
+    length = max(math.sqrt(x * x + y * y + z * z), _LEAST_LENGTH)
+    cosine = abs(x * lamp.direction[0] + y * lamp.direction[1] + z * lamp.direction[2]) / length
+    return float(lamp.ambient + (1.0 - lamp.ambient) * cosine)
+
+
+@njit
+def shade(
+    points: F32, faces: I32, triangle: I32, p: Projection, looks: Looks, lamp: Lamp, dim: F32, out: U8
+) -> None:
+    """Lit colours into ``out`` uint8 (h, w, 3), each pixel the mean of a square of those of ``triangle``.
+
+    ``triangle`` int32 (k h, k w), a few more rows or columns do no harm; ``dim`` float32 of its shape darkens, or is
+    empty.
+    """
+    height, width = out.shape[:2]
+    fine = max(triangle.shape[0] // height, 1)
+    total, seen, last = np.empty(3), np.empty((3, 9)), NOTHING
+    for row in range(height):
+        for column in range(width):
+            total[:] = 0.5 * fine * fine  # to round
+            for n in range(fine * fine):
+                v, u = row * fine + n // fine, column * fine + n % fine
+                t = triangle[v, u]
+                if t != last and t >= 0:
+                    _corners(points, faces, t, p.orthographic, looks, seen)
+                    last = t
+                if t < 0:
+                    for k in range(3):
+                        total[k] += lamp.paper[k]
+                else:
+                    darker = dim[v, u] if dim.size else 1.0
+                    _add_shaded(seen, (u - p.cx) / p.fx, (v - p.cy) / p.fy, lamp, darker, total)
+            for k in range(3):
+                out[row, column, k] = np.uint8(min(total[k] / (fine * fine), 255.0))
+
+
+@njit
+def _corners(points: F32, faces: I32, t: int, orthographic: bool, looks: Looks, out: F64) -> None:
+    """Of each corner of a triangle: its barycentric weight as 1, x and y make it up; colour and normal.
+
+    The weight is that of :func:`_weights`, which is linear in the sight line (x, y).
+    """
+    for k in range(3):
+        i, b, c = faces[t, k], faces[t, (k + 1) % 3], faces[t, (k + 2) % 3]
+        b0, b1, b2 = float(points[b, 0]), float(points[b, 1]), float(points[b, 2])
+        c0, c1, c2 = float(points[c, 0]), float(points[c, 1]), float(points[c, 2])
+        if orthographic:
+            b2 = c2 = 1.0
+        out[k, 0], out[k, 1], out[k, 2] = b0 * c1 - b1 * c0, b1 * c2 - b2 * c1, b2 * c0 - b0 * c2
+        for m in range(3):
+            out[k, 3 + m] = looks.colours[i, m]
+            out[k, 6 + m] = looks.normals[i, m]
+
+
+@njit
+def _add_shaded(corners: F64, x: float, y: float, lamp: Lamp, darker: float, total: F64) -> None:
+    """Add what the sight line (x, y) sees of a triangle; one that just misses it takes its border."""
+    a = corners[0, 0] + corners[0, 1] * x + corners[0, 2] * y
+    b = corners[1, 0] + corners[1, 1] * x + corners[1, 2] * y
+    c = corners[2, 0] + corners[2, 1] * x + corners[2, 2] * y
+    sign = 1.0 if a + b + c > 0.0 else -1.0
+    a, b, c = max(a * sign, 0.0), max(b * sign, 0.0), max(c * sign, 0.0)
+    if not a + b + c > 0.0:  # exactly edge-on
+        a = 1.0
+    share = 1.0 / (a + b + c)
+    a, b, c = a * share, b * share, c * share
+    nx = a * corners[0, 6] + b * corners[1, 6] + c * corners[2, 6]
+    ny = a * corners[0, 7] + b * corners[1, 7] + c * corners[2, 7]
+    nz = a * corners[0, 8] + b * corners[1, 8] + c * corners[2, 8]
+    light = darker * brightness(lamp, nx, ny, nz)
+    for k in range(3, 6):
+        total[k - 3] += light * (a * corners[0, k] + b * corners[1, k] + c * corners[2, k])
 
 
 @njit

@@ -80,16 +80,16 @@ def from_above(low: F64, high: F64, metres_per_pixel: float, cull: bool = True) 
 
 def render(view: View, vertices: F32, faces: I32, values: F32 = _NO_VALUES) -> Rendering:
     """Draw faces int32 (m, 3) of ``vertices`` float32 (n, 3); ``values`` float32 (n, k) are interpolated."""
-    points, triangle, nearness = _visible(view, vertices, faces)
+    points, triangle, nearness = visible(view, vertices, faces)
     if values.shape[1] == 0:
-        return Rendering(_depth(view, nearness), triangle, np.zeros((*triangle.shape, 0), np.float32))
+        return Rendering(depth_of(view, nearness), triangle, np.zeros((*triangle.shape, 0), np.float32))
     sight = _Sight(points, triangle, _sight_lines(view), view.projection.orthographic)
     return _interpolated(sight, faces, values)
 
 
 def depth_map(view: View, vertices: F32, faces: I32) -> F32:
     """Reference depth float32 (h, w): metres along z, NaN where nothing."""
-    return _depth(view, _visible(view, vertices, faces)[2])
+    return depth_of(view, visible(view, vertices, faces)[2])
 
 
 def render_camera(
@@ -116,11 +116,11 @@ class _Sight:
 def _look(camera: CameraModel, T_world_cam: F64, vertices: F32, faces: I32) -> _Sight:
     if not any(camera.distortion):
         view = perspective(camera, T_world_cam)
-        points, triangle, _ = _visible(view, vertices, faces)
+        points, triangle, _ = visible(view, vertices, faces)
         return _Sight(points, triangle, _sight_lines(view))
     lines = undistorted_lines(camera)
     canvas = _canvas_behind(camera, lines, T_world_cam)
-    points, triangle, _ = _visible(canvas, vertices, faces)
+    points, triangle, _ = visible(canvas, vertices, faces)
     p = canvas.projection
     reached = np.isfinite(lines[..., 0])
     x, y = np.nan_to_num(lines[..., 0]), np.nan_to_num(lines[..., 1])
@@ -129,8 +129,11 @@ def _look(camera: CameraModel, T_world_cam: F64, vertices: F32, faces: I32) -> _
     return _Sight(points, np.where(reached, triangle[v, u], np.int32(NOTHING)), lines)
 
 
-def _visible(view: View, vertices: F32, faces: I32) -> tuple[F32, I32, F32]:
-    """Points in view coordinates, triangle and nearness per pixel."""
+def visible(view: View, vertices: F32, faces: I32) -> tuple[F32, I32, F32]:
+    """Points float32 (n, 3) in view coordinates; per pixel the triangle int32 (h, w) and nearness float32 (h, w).
+
+    Nearness is 1 / z, of an orthographic view -z; where nothing is seen NOTHING and -inf.
+    """
     points, image = np.empty((2, len(vertices), 3), np.float32)
     project(vertices, view.T_view_world, view.projection, points, image)
     nearness = np.full((view.height, view.width), -np.inf, np.float32)
@@ -139,7 +142,8 @@ def _visible(view: View, vertices: F32, faces: I32) -> tuple[F32, I32, F32]:
     return points, triangle, nearness
 
 
-def _depth(view: View, nearness: F32) -> F32:
+def depth_of(view: View, nearness: F32) -> F32:
+    """Metres along z, NaN where nothing, from the nearness of :func:`visible`."""
     with np.errstate(divide="ignore"):
         depth = -nearness if view.projection.orthographic else 1.0 / nearness
     return np.where(nearness == -np.inf, np.float32(np.nan), depth)

@@ -87,7 +87,10 @@ class FakeMapper:
 
 @pytest.fixture
 def fake_pipeline(monkeypatch: pytest.MonkeyPatch) -> list[FakeMapper]:
-    """Puts FakeMapper in the place of the pipeline; the list holds those made (the last one maps)."""
+    """Puts FakeMapper in the place of the pipeline; the list holds those made (the last one maps).
+
+    Nothing is compiled for it beforehand.
+    """
     made: list[FakeMapper] = []
 
     def make(config: object, odometry: Odometry, page_folder: Path, segmenter: object = None) -> FakeMapper:
@@ -95,6 +98,7 @@ def fake_pipeline(monkeypatch: pytest.MonkeyPatch) -> list[FakeMapper]:
         made.append(FakeMapper(odometry))
         return made[-1]
 
+    monkeypatch.setattr("artemis_edge.runtime.compile_ahead", lambda *_: None)
     monkeypatch.setitem(sys.modules, "artemis_edge.pipeline", SimpleNamespace(Pipeline=make))
     return made
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from artemis_edge import render
+from artemis_edge import raster, render
 from artemis_edge.errors import InputError
 from artemis_edge.export.ply import bare_mesh, write_ply
 from artemis_edge.frames import CameraModel
@@ -169,6 +169,35 @@ def test_map_from_above() -> None:
     assert (seen.triangle[seen.covered] < 2).all()
     open_top = render.render(render.from_above(low, high, 0.1, cull=False), vertices, faces)
     assert (open_top.triangle[open_top.covered] >= 2).all()
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("dimmed", [False, True])
+def test_shading_is_that_of_every_pixel_by_itself(orthographic: bool, dimmed: bool) -> None:
+    """The slow twin: each fine pixel's colour and normal by ``render``, lit, then the mean of each square."""
+    rng = np.random.default_rng(3)
+    sphere = trimesh.creation.icosphere(2, radius=2.0)
+    vertices, faces = sphere.vertices.astype(np.float32), sphere.faces.astype(np.int32)
+    colours = rng.integers(0, 256, (len(vertices), 3)).astype(np.uint8)
+    normals = (sphere.vertex_normals * rng.uniform(0.5, 2.0, (len(vertices), 1))).astype(np.float32)
+    normals[7] = 0.0
+    above = render.from_above(np.array([-2.5, -2, -2]), np.array([2.5, 2, 2]), 0.05)
+    view = above if orthographic else render.perspective(CAMERA, pose(-5, 0, 0), cull=True)
+    lamp = raster.Lamp(np.array([0.0, 0.6, 0.8]), 0.4, np.array([250, 240, 230], np.uint8))
+    seen = render.render(view, vertices, faces, np.concatenate([colours, normals], 1).astype(np.float32))
+    dim = rng.uniform(0.5, 1.0, seen.triangle.shape).astype(np.float32)
+    normal = seen.values[..., 3:]
+    cosine = np.abs(normal @ lamp.direction) / np.maximum(np.linalg.norm(normal, axis=2), 1e-6)
+    light = (0.4 + 0.6 * cosine) * (dim if dimmed else 1.0)
+    fine = np.where(seen.covered[..., None], seen.values[..., :3] * light[..., None], lamp.paper)
+    h, w = (n // 2 for n in seen.triangle.shape)
+    expected = fine[: 2 * h, : 2 * w].reshape(h, 2, w, 2, 3).mean(axis=(1, 3))
+    points, triangle, _ = render.visible(view, vertices, faces)
+    out = np.empty((h, w, 3), np.uint8)
+    looks = raster.Looks(colours, normals)
+    raster.shade(points, faces, triangle, view.projection, looks, lamp, dim if dimmed else dim[:0], out)
+    assert 0.2 < seen.covered.mean() < 0.95
+    assert np.abs(out - expected).max() < 0.51
 
 
 def test_degenerate_input_draws_nothing() -> None:

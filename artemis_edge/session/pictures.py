@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,9 +12,9 @@ import numpy as np
 
 from artemis_edge.evaluate.mesh import Comparison, MeshEvaluation
 from artemis_edge.export.mesh import Mesh, finite_rows
-from artemis_edge.frames import F32, F64, U8, CameraModel, Trajectory
-from artemis_edge.raster import Projection
-from artemis_edge.render import Rendering, View, from_above, perspective, render, write_png
+from artemis_edge.frames import F32, F64, I32, U8, CameraModel, Trajectory
+from artemis_edge.raster import Lamp, Looks, Projection, shade
+from artemis_edge.render import View, depth_of, from_above, perspective, visible, write_png
 from artemis_edge.session import drawing
 
 Kind = Literal["texture", "label", "confidence", "height"]
@@ -30,6 +31,7 @@ _NARROWEST = 0.25  # a corridor's picture has room for legend and scale
 _LIGHT = np.array([-0.35, 0.45, 0.82])
 _AMBIENT = 0.45
 _EDGE_STRENGTH = 12.0
+_UNDIMMED = np.empty((0, 0), np.float32)
 _TILTED = 0.7  # cosine: an axis counts as "up" when the sensor's z is this close to it
 
 
@@ -79,16 +81,22 @@ def _upright(trajectory: Trajectory) -> F64:
 
 def map_from_above(shown: Scene, kind: Kind) -> U8:
     """The map straight from above with path and scale bar, RGB uint8, within 1200 x 800 pixels."""
+    return next(maps_from_above(shown, (kind,)))
+
+
+def maps_from_above(shown: Scene, kinds: Iterable[Kind]) -> Iterator[U8]:
+    """As :func:`map_from_above`, one of each kind."""
     extent = shown.high - shown.low
     metres_per_pixel = float(max(extent[0] / WIDTH, extent[1] / HEIGHT))
     view = from_above(shown.low, shown.high, metres_per_pixel / _SUPERSAMPLING)
-    seen = _render(view, shown, kind)
-    image = _reduced(_shaded(seen, _light_above(seen)))
+    points, triangle, _ = visible(view, shown.vertices, shown.mesh.faces)
     ends = _pixels(view, shown.path) / _SUPERSAMPLING
-    _draw_path(image, ends)
-    drawing.scale_bar(image, metres_per_pixel)
-    _explain(image, shown, kind)
-    return image
+    for kind in kinds:
+        image = _shaded(view, points, triangle, shown, kind)
+        _draw_path(image, ends)
+        drawing.scale_bar(image, metres_per_pixel)
+        _explain(image, shown, kind)
+        yield image
 
 
 def perspective_view(shown: Scene, kind: Kind | None = None) -> U8:
@@ -103,8 +111,8 @@ def perspective_view(shown: Scene, kind: Kind | None = None) -> U8:
     f = 0.75 * size[0]
     camera = CameraModel(int(size[0]), int(size[1]), f, f, size[0] / 2, size[1] / 2)
     view = perspective(camera, _looking_at(eye, target), near_m=0.3, cull=True)
-    seen = _render(view, shown, kind)
-    image = _reduced(_shaded(seen, _light_above(seen) * _edges(seen.depth)))
+    points, triangle, nearness = visible(view, shown.vertices, shown.mesh.faces)
+    image = _shaded(view, points, triangle, shown, kind, _edges(depth_of(view, nearness)))
     _draw_path(image, _pixels(view, shown.path) / _SUPERSAMPLING)
     return image
 
@@ -130,10 +138,14 @@ def write_heat_maps(path: Path, evaluation: MeshEvaluation) -> None:
     write_png(path, heat_maps(evaluation.comparisons[0]))
 
 
-def _render(view: View, shown: Scene, kind: Kind) -> Rendering:
-    """Colours in channels 0..2, normals in 3..5."""
-    values = np.concatenate([_colours(shown, kind).astype(np.float32), shown.normals], axis=1)
-    return render(view, shown.vertices, shown.mesh.faces, values)
+def _shaded(view: View, points: F32, triangle: I32, shown: Scene, kind: Kind, dim: F32 = _UNDIMMED) -> U8:
+    """Lit from above, RGB uint8; ``points`` and ``triangle`` as of ``render.visible``."""
+    colours = np.ascontiguousarray(_colours(shown, kind), np.uint8)
+    looks = Looks(colours, np.ascontiguousarray(shown.normals, np.float32))
+    lamp = Lamp(_LIGHT / np.linalg.norm(_LIGHT), _AMBIENT, np.array(drawing.PAPER, np.uint8))
+    image = np.empty((*(n // _SUPERSAMPLING for n in triangle.shape), 3), np.uint8)
+    shade(points, shown.mesh.faces, triangle, view.projection, looks, lamp, dim, image)
+    return image
 
 
 def _colours(shown: Scene, kind: Kind) -> U8:
@@ -148,15 +160,6 @@ def _colours(shown: Scene, kind: Kind) -> U8:
     return mesh.colours
 
 
-def _light_above(seen: Rendering) -> F32:
-    """Brightness (h, w) of a matt surface under a light from above; either side of it counts."""
-    normal = seen.values[..., 3:]
-    length = np.maximum(np.linalg.norm(normal, axis=2), 1e-6)
-    cosine = np.abs(normal @ _LIGHT.astype(np.float32)) / length
-    light: F32 = (_AMBIENT + (1.0 - _AMBIENT) * cosine / np.linalg.norm(_LIGHT)).astype(np.float32)
-    return light
-
-
 def _edges(depth: F32) -> F32:
     """Darkening (h, w) 0..1 beside nearer surfaces (eye-dome lighting, Boucheny 2009)."""
     log_depth = np.log2(np.where(np.isnan(depth), np.float32(1e4), depth))
@@ -166,16 +169,6 @@ def _edges(depth: F32) -> F32:
             drop += np.clip(log_depth - np.roll(log_depth, step, axis), 0.0, 0.1)
     shade: F32 = np.exp2(-_EDGE_STRENGTH / 4.0 * drop)
     return shade
-
-
-def _shaded(seen: Rendering, light: F32) -> U8:
-    colour = seen.values[..., :3] * light[..., None]
-    return np.where(seen.covered[..., None], np.rint(colour).clip(0, 255), drawing.PAPER).astype(np.uint8)
-
-
-def _reduced(image: U8) -> U8:
-    height, width = (max(n // _SUPERSAMPLING, 1) for n in image.shape[:2])
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _pixels(view: View, points: F64) -> F64:

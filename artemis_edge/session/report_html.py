@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from artemis_edge.session.report import Evaluation
 
 _WEBP_QUALITY = 90
+_KINDS: tuple[pictures.Kind, ...] = ("texture", "label", "confidence", "height")
+_NAMES = ("texture", "labels", "confidence", "height")
 _STYLE = """
 :root { color: #26292f; background: #f4f5f6; font: 15px/1.5 system-ui, "Segoe UI", sans-serif; }
 * { box-sizing: border-box; }
@@ -103,10 +105,10 @@ def _maps(mesh: Mesh, trajectory: Trajectory, evaluation: Evaluation | None) -> 
     shown = pictures.scene(mesh, trajectory)
     figures = [
         _picture(pictures.perspective_view(shown), "In perspective, with the way that was gone", wide=True),
-        _picture(pictures.map_from_above(shown, "texture"), "From above: texture"),
-        _picture(pictures.map_from_above(shown, "label"), "From above: labels"),
-        _picture(pictures.map_from_above(shown, "confidence"), "From above: confidence"),
-        _picture(pictures.map_from_above(shown, "height"), "From above: height"),
+        *(
+            _picture(picture, f"From above: {name}")
+            for picture, name in zip(pictures.maps_from_above(shown, _KINDS), _NAMES, strict=True)
+        ),
     ]
     reference = None
     if evaluation is not None and evaluation.mesh is not None:
