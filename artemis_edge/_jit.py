@@ -20,11 +20,12 @@ _PORTABLE_CPU = {"x86_64": "x86-64-v3", "AMD64": "x86-64-v3"}
 
 @cache
 def sources_hash() -> str:
-    """Hash of every Python source of both packages: the same sources share one kernel cache."""
+    """Hash of every Python source of both packages and of where they are, for numba tells kernels apart by both."""
     import artemis_drivers
 
     digest = hashlib.sha256()
     for root in (Path(__file__).parent, Path(artemis_drivers.__file__).parent):
+        digest.update(str(root.resolve()).encode())
         for path in sorted(root.rglob("*.py")):
             digest.update(path.relative_to(root).as_posix().encode())
             digest.update(path.read_bytes())

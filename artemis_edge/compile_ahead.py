@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from artemis_edge._jit import cache_dir
+from artemis_edge._jit import cache_dir, sources_hash
 from artemis_edge.errors import UserError
 from artemis_edge.frames import FrameSource, Odometry, SyncedFrame, Trajectory
 
@@ -49,14 +49,9 @@ class Compilation:
         for child in self._children:
             child.join()
         if all(child.exitcode == 0 for child in self._children):
-            leave(self._marker)
-
-
-def leave(marker: Path) -> None:
-    """Remember that something was compiled; where that cannot be written, it is compiled again another time."""
-    with contextlib.suppress(OSError):
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.touch()
+            with contextlib.suppress(OSError):  # then it is compiled again another time
+                self._marker.parent.mkdir(parents=True, exist_ok=True)
+                self._marker.touch()
 
 
 def compile_ahead(request: Request, source: FrameSource, span: range) -> None:
@@ -80,7 +75,7 @@ def _kind(request: Request, source: FrameSource, span: range, own: bool) -> str:
     except UserError:
         frame = None
     poses = "own" if own else "given"
-    text = f"{sys.version} {poses} {_types(frame)} {bool(request.queries)}"
+    text = f"{sources_hash()} {sys.version} {poses} {_types(frame)} {bool(request.queries)}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -53,6 +54,7 @@ class Pipeline:
         active = None if self.semantics is None else self.semantics.active
         self.outbox = Outbox(self.voxel_map.store, active)
         self.tracked: TrackedFrame | None = None
+        self._uncoloured: TrackedFrame | None = None
         self.trajectory: list[tuple[int, F64]] = []
         self.stage_ms: dict[str, float] = {}
         self._stamp = 0
@@ -67,11 +69,10 @@ class Pipeline:
         self.tell_everything()
 
     def process(self, frame: SyncedFrame) -> MeshDelta:
-        """All stages for one frame."""
+        """All stages for one frame; its images are refined with the next one (``_track``)."""
+        self.stage_ms = {"odometry": 0.0, "refinement": 0.0}
+        tracked = self.tracked = self._track(frame)
         self._stamp += 1
-        self.stage_ms = {}
-        with self._stage("odometry"):
-            tracked = self.tracked = self.odometry.track(frame)
         with self._stage("voxel_map"):
             active = self.voxel_map.insert(tracked, self._stamp)
             self.pager.bring_back(self.voxel_map.touched_blocks(), self._stamp)
@@ -80,8 +81,6 @@ class Pipeline:
         self._fuse_masks()
         with self._stage("mesher"):
             self.mesher.update(active, self._stamp)
-        with self._stage("refinement"):
-            self.refinement.update(tracked, self._stamp)
         self._offer_images(tracked)
         with self._stage("delta"):
             # what goes to disk must have been told
@@ -89,6 +88,7 @@ class Pipeline:
             delta = self.outbox.everything(frame.index) if tight else self.outbox.changed(frame.index)
             self.pager.make_room(self._stamp)
         self.trajectory.append((tracked.stamp_ns, tracked.T_world_lidar))
+        self._uncoloured = tracked
         return delta
 
     def ask(self, slots: Mapping[int, str]) -> None:
@@ -114,6 +114,7 @@ class Pipeline:
     def finish(self) -> MeshDelta:
         """Everything postponed; the delta holds all that was not told yet."""
         self.stage_ms = {}
+        self._colour()
         self._fuse_masks(last=True)
         if self.semantics is not None and self.config.voxel_map.dynamic_filter:
             with self._stage("free_space"):
@@ -126,6 +127,22 @@ class Pipeline:
             self.refinement.finish()
         with self._stage("delta"):
             return self.outbox.everything(self._stamp)
+
+    def _track(self, frame: SyncedFrame) -> TrackedFrame:
+        """The frame's pose; on the other core meanwhile the colours of the last frame: neither needs the other."""
+        with ThreadPoolExecutor(1) as beside:
+            colouring = beside.submit(self._colour)
+            with self._stage("odometry"):
+                tracked = self.odometry.track(frame)
+            colouring.result()
+        return tracked
+
+    def _colour(self) -> None:
+        """Refine the map with the images of the last frame, unless that is done."""
+        last, self._uncoloured = self._uncoloured, None
+        if last is not None:
+            with self._stage("refinement"):
+                self.refinement.update(last, self._stamp)
 
     def _semantics(self) -> SemanticMap:
         assert self.segmenter is not None

@@ -11,7 +11,7 @@ from artemis_edge.frames import LidarScan, SyncedFrame
 from artemis_edge.pipeline import Pipeline
 from tests import naive
 
-STAGES = ["odometry", "voxel_map", "free_space", "mesher", "refinement", "delta"]
+STAGES = ["odometry", "refinement", "voxel_map", "free_space", "mesher", "delta"]
 
 
 @pytest.fixture(autouse=True)

@@ -83,7 +83,28 @@ def test_hit_store_keeps_the_nearest_beam_of_a_cube() -> None:
     hit = np.array([[1.01, 0, 0], [1.02, 0, 0], [5.0, 0, 0], [1.03, 0, 0]])
     origin = np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0, 0], [0.9, 0, 0]])
     store.add(hit, origin, np.array([0, 0, 0, 1], np.int32))
-    store.thin()
     assert store.hit[:, 0].tolist() == [1.02, 5.0, 1.03]
-    store.thin()
+    store.add(hit, origin, np.array([0, 0, 0, 1], np.int32))
     assert len(store.hit) == 3
+
+
+def test_hit_store_against_a_dictionary_while_it_grows() -> None:
+    rng = np.random.default_rng(4)
+    store, naive = HitStore(), dict[tuple[int, ...], tuple[float, list[float]]]()
+    for _ in range(4):
+        hit, origin = rng.uniform(-1.5, 1.5, (2, 40_000, 3))
+        instance = rng.integers(-2, 2, len(hit)).astype(np.int32)
+        store.add(hit, origin, instance)
+        length2 = ((hit - origin) ** 2).sum(axis=1)
+        for cube, of, beam, d2 in zip(np.floor(hit / 0.05).astype(int), instance, hit, length2, strict=True):
+            key = (int(of), *cube.tolist())
+            if key not in naive or d2 < naive[key][0]:
+                naive[key] = d2, beam.tolist()
+    assert len(store.hit) == len(naive) > 1 << 16  # it had to grow
+    found = {
+        (int(of), *np.floor(h / 0.05).astype(int).tolist()): h.tolist()
+        for of, h in zip(store.instance, store.hit, strict=True)
+    }
+    assert found == {key: beam for key, (_, beam) in naive.items()}
+    store.add(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.int32))
+    assert len(store.origin) == len(naive)

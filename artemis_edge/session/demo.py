@@ -52,7 +52,7 @@ def demo(
     prepare(session)
     request = Request(session, out, own_odometry=True, queries=tuple(queries))
     say(f"recording a walk of {seconds:g} s through the virtual world '{world}'")
-    with compiling(request, world, seed, _SETTINGS), reporter("recording") as report:
+    with compiling(request), reporter("recording") as report:
         made = simulate(world, seed, seconds, "avia", session, _SETTINGS, report)
     for note in made.notes:
         say(f"note: {note}")

@@ -205,7 +205,6 @@ def _write_reference(path: Path, pieces: Iterator[ObservedSurface], world: World
 
 def _write_moving(path: Path, store: HitStore, world: World, T: F64) -> int:
     """Where beams met what moves: not part of the reference, because it was elsewhere at other times."""
-    store.thin()
     rows = np.empty(len(store.hit), _MOVING_POINT)
     rows["position"] = _moved(store.hit, T)
     rows["label"], rows["instance"] = _mover_labels(world, store.instance), store.instance

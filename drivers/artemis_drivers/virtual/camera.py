@@ -217,7 +217,7 @@ class VirtualCamera:
             lines, rows = self.lines[:, :, 4], (first, last)
             expose(self._film, lines, moved, lens, self._falloff, noise, efficiency, amplified, rows, raw)
 
-        self._in_bands(band)
+        self._in_bands(band, self.spec.height)
         return raw
 
     def _see(self, scene: Scene, sun: F64, T_world_cam: F64, time_s: float) -> Parts:
@@ -239,12 +239,12 @@ class VirtualCamera:
                 scene.surface, arrays, self._shadow, passing, parts, ids, sub_pixels[n], lines[n], wide, film
             )
 
-        self._in_bands(band)
+        self._in_bands(band, self.spec.height)
         return parts
 
-    def _in_bands(self, work: Callable[[int, int], None]) -> None:
-        """Do work(first, last) on bands of rows that together are the image."""
-        edges = [k * self.spec.height // self.threads for k in range(self.threads + 1)]
+    def _in_bands(self, work: Callable[[int, int], None], rows: int) -> None:
+        """Do work(first, last) on bands that together are so many rows."""
+        edges = [k * rows // self.threads for k in range(self.threads + 1)]
         list(self._pool.map(work, edges[:-1], edges[1:]))
 
     def _draw(self, scene: Scene, parts: Parts) -> None:
@@ -253,7 +253,12 @@ class VirtualCamera:
         T = _view_of(parts, 0)
         seen = scene.object_centre @ T[:3, :3].T + T[:3, 3]
         chosen = np.flatnonzero(self._within(seen, scene.object_radius)[scene.object_of]).astype(np.int32)
-        draw(self._canvas, self.view, T, self._local, scene.mesh.triangles, chosen, 0)
+
+        def band(first: int, last: int) -> None:
+            canvas = self._canvas._replace(top=first, bottom=last)
+            draw(canvas, self.view, T, self._local, scene.mesh.triangles, chosen, 0)
+
+        self._in_bands(band, self._canvas.nearness.shape[0])
         for k, mover in enumerate(scene.movers, start=1):
             T = _view_of(parts, k)
             if self._within(T[None, :3, 3], np.array([mover.radius]))[0]:

@@ -33,6 +33,7 @@ _COARSE_M = 0.5
 _PORTION = 1_000_000  # points handled at once by each worker: bounds memory
 _WORKERS = 2  # the kernels release the interpreter lock; the result does not depend on it
 _EMPTY = np.int64(-1)
+_ROOM = 1 << 16  # beams; doubles as needed
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,38 +51,78 @@ class ObservedSurface:
 
 
 class HitStore:
-    """Remembers where beams met objects, thinned: positions, origins (world, metres) and instance numbers."""
+    """Remembers where beams met objects: of those that met an object in the same cube the one from nearest.
+
+    ``hit`` and ``origin`` float64 (n, 3) in the world, metres, ``instance`` int32 (n,).
+    """
 
     def __init__(self) -> None:
-        self._pending: list[tuple[F64, F64, I32]] = []
         self._count = 0
-        self.hit = np.empty((0, 3))
-        self.origin = np.empty((0, 3))
-        self.instance = np.empty(0, np.int32)
+        self._beam = np.empty((_ROOM, 6))
+        self._object = np.empty(_ROOM, np.int32)
+        self._table = np.full(2 * _ROOM, -1, np.int32)
+
+    @property
+    def hit(self) -> F64:
+        """Where the beams met something."""
+        return self._beam[: self._count, :3]
+
+    @property
+    def origin(self) -> F64:
+        """Where they came from."""
+        return self._beam[: self._count, 3:]
+
+    @property
+    def instance(self) -> I32:
+        """What they met."""
+        return self._object[: self._count]
 
     def add(self, hit: F64, origin: F64, instance: I32) -> None:
         """Add beams: noise-free ``hit`` and ``origin`` float64 (n, 3), ``instance`` of the object met (of
         what stands still, as :func:`witnesses` gives it).
         """
-        self._pending.append((hit, origin, instance))
-        self._count += len(hit)
-        if self._count > max(2_000_000, len(self.hit)):
-            self.thin()
+        while self._count + len(hit) > len(self._object):
+            self._grow()
+        beams = np.hstack([hit, origin])
+        self._count = int(remember(beams, instance, self._table, self._beam, self._object, self._count))
 
-    def thin(self) -> None:
-        """Keep the nearest beam per object and cube."""
-        parts = [(self.hit, self.origin, self.instance), *self._pending]
-        hit, origin, instance = (np.concatenate(column) for column in zip(*parts, strict=True))
-        cube = np.floor(hit / _THIN_M).astype(np.int64)
-        key = (
-            (instance.astype(np.int64) * 73856093) ^ (cube[:, 0] * 19349663 + cube[:, 1]) * 83492791
-        ) + cube[:, 2]
-        nearest = np.lexsort((((hit - origin) ** 2).sum(axis=1), key))
-        first = np.ones(len(key), bool)
-        first[1:] = key[nearest[1:]] != key[nearest[:-1]]
-        kept = np.sort(nearest[first])
-        self.hit, self.origin, self.instance = hit[kept], origin[kept], instance[kept]
-        self._pending, self._count = [], 0
+    def _grow(self) -> None:
+        known, of = self._beam[: self._count], self._object[: self._count]
+        room = 2 * len(self._object)
+        self._beam, self._object = np.empty((room, 6)), np.empty(room, np.int32)
+        self._table = np.full(2 * room, -1, np.int32)
+        self._count = int(remember(known, of, self._table, self._beam, self._object, 0))
+
+
+@njit
+def remember(beams: F64, instance: I32, table: I32, kept: F64, kept_instance: I32, count: int) -> int:
+    """Put beams (n, 6: hit, origin) into ``kept``, of which ``count`` rows are used; returns how many then are.
+
+    ``table`` is a hash table of rows, -1 where empty, at least twice as long as ``kept``.
+    """
+    mask = len(table) - 1
+    for i in range(len(beams)):
+        b = beams[i]
+        key = _key(b[0], b[1], b[2], _THIN_M)
+        slot = (key ^ (np.int64(instance[i]) * 73856093)) * 0x2545F4914F6CDD1D
+        slot = (slot ^ (slot >> 32)) & mask
+        while table[slot] >= 0:
+            k = kept[table[slot]]
+            if kept_instance[table[slot]] == instance[i] and _key(k[0], k[1], k[2], _THIN_M) == key:
+                if _length2(b) < _length2(k):
+                    k[:] = b
+                break
+            slot = (slot + 1) & mask
+        else:
+            table[slot] = count
+            kept[count], kept_instance[count] = b, instance[i]
+            count += 1
+    return count
+
+
+@njit
+def _length2(beam: F64) -> float:
+    return float((beam[0] - beam[3]) ** 2 + (beam[1] - beam[4]) ** 2 + (beam[2] - beam[5]) ** 2)
 
 
 def witnesses(mesh: WorldMesh, atlas: TextureAtlas) -> I32:
@@ -98,7 +139,6 @@ def observed_surface(mesh: WorldMesh, scene: Scene, store: HitStore, spacing_m: 
 
     ``scene`` holds everything that may stand in between (``mesh`` included).
     """
-    store.thin()
     corners = mesh.corners().astype(np.float64) - scene.origin
     low, high = corners.min(axis=(0, 1)) - REACH_M, corners.max(axis=(0, 1)) + REACH_M
     local = store.hit - scene.origin

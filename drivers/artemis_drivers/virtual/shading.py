@@ -116,7 +116,15 @@ def mover_shadows(scene: Scene, parts: Parts, sun: F64) -> MoverShadows:
         T[:3, :3] = R @ parts.R_scene_local[k + 1]
         view = View(1 / _MOVER_SHADOW_M, 1 / _MOVER_SHADOW_M, size / 2, size / 2, True)
         every = np.arange(len(mover.mesh.triangles), dtype=np.int32)
-        draw(Canvas(out.depth[row], no_names), view, T, local_mover(mover), mover.mesh.triangles, every, 0)
+        draw(
+            Canvas(out.depth[row], no_names, 0, out.depth.shape[1]),
+            view,
+            T,
+            local_mover(mover),
+            mover.mesh.triangles,
+            every,
+            0,
+        )
         out.rows[row, :, :3], out.rows[row, :, 3] = R, -R @ parts.t_scene_local[k + 1]
         out.rows[row, :2] /= _MOVER_SHADOW_M
         out.rows[row, :2, 3] += size / 2

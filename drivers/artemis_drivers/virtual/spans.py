@@ -31,18 +31,20 @@ class View(NamedTuple):
 
 class Canvas(NamedTuple):
     """``nearness`` float32 (h, w), -inf where nothing; ``triangle`` int32 (h, w), NOTHING there, or (0, 0)
-    where nobody asks for it.
+    where nobody asks for it. Only rows ``top`` .. ``bottom`` - 1 are drawn to.
     """
 
     nearness: F32
     triangle: I32
+    top: int
+    bottom: int
 
 
 def new_canvas(width: int, height: int, named: bool = True) -> Canvas:
     """An empty canvas."""
     size = (height, width)
     names = np.full(size if named else (0, 0), NOTHING, np.int32)
-    return Canvas(np.full(size, -np.inf, np.float32), names)
+    return Canvas(np.full(size, -np.inf, np.float32), names, 0, height)
 
 
 def clear(canvas: Canvas) -> None:
@@ -107,6 +109,8 @@ def _fill(canvas: Canvas, a: Point, b: Point, c: Point, name: int) -> None:
     area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
     if not area < 0.0:  # from behind, edge-on, or not a number
         return
+    if max(a[1], b[1], c[1]) < canvas.top or min(a[1], b[1], c[1]) >= canvas.bottom:
+        return
     low, high = min(a[2], b[2], c[2]), max(a[2], b[2], c[2])
     gx = ((b[2] - a[2]) * (c[1] - a[1]) - (c[2] - a[2]) * (b[1] - a[1])) / area
     gy = ((c[2] - a[2]) * (b[0] - a[0]) - (b[2] - a[2]) * (c[0] - a[0])) / area
@@ -139,8 +143,8 @@ def _half(
     that both its triangles compute the same crossings.
     """
     nearness, triangle = canvas.nearness, canvas.triangle
-    height, width = nearness.shape
-    first, last = int(np.ceil(max(p[1], 0.0))), int(np.ceil(min(q[1], float(height))))
+    width = nearness.shape[1]
+    first, last = int(np.ceil(max(p[1], float(canvas.top)))), int(np.ceil(min(q[1], float(canvas.bottom))))
     if first >= last:
         return
     named = triangle.shape[0] > 0
