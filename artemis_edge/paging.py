@@ -31,9 +31,13 @@ from artemis_edge.block_store import (
 )
 from artemis_edge.errors import RunError
 from artemis_edge.frames import F32, I32, I64, U8, Bool
+from artemis_edge.key_set import KeySet
 from artemis_edge.voxel_map import AT_ONCE
 
 TIGHT = 0.85  # share of a pool from which on blocks go to disk
+_ROOMY = 0.70  # share until which they go
+# Blocks that go at a time, so that no frame pays for many; above _NEARLY_FULL as many as must
+MOST_OUT, _NEARLY_FULL = 24, 0.92
 _ADOPTED = 0.5  # share of memory that a map made before may take
 BUSY_FRAMES = 50  # a block seen this lately is not sent to disk
 
@@ -424,6 +428,7 @@ class PageFile:
         self._path = folder / "pages.bin"
         self._file: BinaryIO | None = None
         self._place: dict[int, tuple[int, int, int]] = {}
+        self._known = KeySet()  # the same keys, for kernels
         self._end = 0
 
     def __len__(self) -> int:
@@ -436,6 +441,10 @@ class PageFile:
         """Sorted keys of the blocks on disk."""
         return np.array(sorted(self._place), np.int64)
 
+    def around(self, block: I32) -> I64:
+        """Sorted keys of those of the blocks (n, 3) and of their neighbours that are on disk."""
+        return self._known.around(block)
+
     def put(self, key: int, page: Page) -> None:
         """Append a page; the file is made when first needed."""
         if self._file is None:
@@ -445,6 +454,7 @@ class PageFile:
         self._file.seek(self._end)
         self._file.write(data)
         self._place[key] = (self._end, len(data), len(self.mend))
+        self._known.add(key)
         self._end += len(data)
 
     def get(self, key: int) -> Page:
@@ -461,6 +471,7 @@ class PageFile:
         """The page of a block that becomes resident again."""
         page = self.get(key)
         del self._place[key]
+        self._known.remove(key)
         return page
 
     def flush(self) -> None:
@@ -508,6 +519,17 @@ class Companion(Protocol):
         ...
 
 
+def _rehearse() -> None:
+    """Load the kernels of paging: the first block that goes to disk must not stop a frame for a second."""
+    store = bs.allocate(0.0)
+    slot = bs.find_or_add_block(store, 0, 0, 0)
+    has_waiting(store, slot)
+    page = page_from_bytes(page_bytes(pack(store, np.array([slot], np.int32))))
+    restore_block(store, slot, 0, *page.arrays())
+    bs.remove_block(store, slot)
+    KeySet().around(np.zeros((1, 3), np.int32))
+
+
 class Pager:
     """Keeps a store within its pools: the least recently seen blocks go to disk and come back when touched."""
 
@@ -520,6 +542,8 @@ class Pager:
         # Times a neighbour could not come back: the budget is too small for one frame's surroundings, and patches
         # at that border may not meet
         self.left_on_disk = 0
+        self._drains = False
+        _rehearse()
 
     def resident(self) -> I32:
         """Slots of resident blocks, sorted by key."""
@@ -538,13 +562,12 @@ class Pager:
         if len(self.file) == 0 or len(touched) == 0:
             return
         block = self._store.block[touched, BX : BX + 3]
-        around = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)
-        keys = np.unique(block_keys((block[:, None] + around[None]).reshape(-1, 3).astype(np.int32)))
-        wanted = [key for key in keys.tolist() if key in self.file]
+        wanted = self.file.around(block)
+        if len(wanted) == 0:
+            return
+        self._store.block[touched, SEEN] = stamp
         own = set(block_keys(block).tolist())
-        if wanted:
-            self._store.block[touched, SEEN] = stamp
-        for key in wanted:
+        for key in wanted.tolist():
             if self.fill() > 0.9:  # of what is in memory only what this frame needs must stay
                 self.make_room(stamp, busy_frames=BUSY_FRAMES - 10)
             if self.fill() > 0.95 and key not in own:
@@ -553,23 +576,37 @@ class Pager:
                 self._restore(key, stamp)
 
     def make_room(self, stamp: int, busy_frames: int = BUSY_FRAMES) -> None:
-        """Send blocks to disk when a pool is 85 % full, until it is 70 % full; never one seen lately."""
-        if self._store.counter[bs.N_TRIANGLES] > 0.85 * len(self._store.triangle):
+        """Send blocks to disk from when a pool is 85 % full until it is 70 % full; never one seen lately.
+
+        At most ``MOST_OUT`` a call, unless memory is nearly full.
+        """
+        if self._store.counter[bs.N_TRIANGLES] > TIGHT * len(self._store.triangle):
             self._compact()
-        if self.fill() < TIGHT:
+        fill = self.fill()
+        self._drains = fill >= (_ROOMY if self._drains else TIGHT)
+        if not self._drains:
             return
         slots = self.resident()
         seen = self._store.block[slots, SEEN]
-        for slot in slots[np.argsort(seen, kind="stable")]:
-            if self._store.block[slot, SEEN] > stamp - busy_frames or self.fill() < 0.70:
+        old = np.flatnonzero(seen <= stamp - busy_frames)
+        out = 0
+        for slot in slots[old[np.argsort(seen[old], kind="stable")]].tolist():
+            if has_waiting(self._store, slot) or self._store.block[slot, CHANGED] != 0:
+                continue
+            self._send(slot)
+            out += 1
+            fill = self.fill()
+            if fill < _ROOMY or (out >= MOST_OUT and fill < _NEARLY_FULL):
                 return
-            if not has_waiting(self._store, slot) and self._store.block[slot, CHANGED] == 0:
-                one = np.array([slot], np.int32)
-                self.file.put(int(slot_keys(self._store, one)[0]), pack(self._store, one))
-                if self._companion is not None:
-                    self._companion.leave(*self._store.block[slot, BX : BX + 3].tolist())
-                bs.remove_block(self._store, slot)
-                self.paged_out += 1
+
+    def _send(self, slot: int) -> None:
+        """One block to disk."""
+        one = np.array([slot], np.int32)
+        self.file.put(int(slot_keys(self._store, one)[0]), pack(self._store, one))
+        if self._companion is not None:
+            self._companion.leave(*self._store.block[slot, BX : BX + 3].tolist())
+        bs.remove_block(self._store, slot)
+        self.paged_out += 1
 
     def prepare(self, blocks: I32, stamp: int) -> None:
         """Have the neighbours of blocks in memory whose patches are about to change."""

@@ -6,10 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from artemis_edge import block_store as bs
 from artemis_edge.frames import I64
-from artemis_edge.paging import Page, PageFile, block_keys, pack, page_bytes, page_from_bytes, restore_block
+from artemis_edge.key_set import KeySet
+from artemis_edge.paging import (
+    MOST_OUT,
+    Page,
+    PageFile,
+    block_keys,
+    pack,
+    page_bytes,
+    page_from_bytes,
+    restore_block,
+)
 from tests import naive
 
 # Holds what the sensor sees in the corridor and half as much again, not the corridor
@@ -157,6 +169,40 @@ def test_newest_page_of_a_block_counts_and_the_file_goes_when_closed(tmp_path: P
     assert not (tmp_path / "pages" / "pages.bin").exists()
 
 
+@given(
+    st.lists(
+        st.tuples(st.booleans(), st.integers(-4, 4), st.integers(-4, 4), st.integers(-4, 4)), max_size=80
+    ),
+    st.integers(0, 3),
+)
+@settings(max_examples=40, deadline=None)
+def test_blocks_on_disk_around_others_are_found(said: list[tuple[bool, int, int, int]], asked: int) -> None:
+    known, there = KeySet(), set()
+    for comes, x, y, z in said:
+        key = bs.block_key(x, y, z)
+        if comes:
+            known.add(key)
+            there.add((x, y, z))
+        elif (x, y, z) in there:
+            known.remove(key)
+            there.remove((x, y, z))
+        assert (key in known) == ((x, y, z) in there)
+    block = np.arange(3 * asked, dtype=np.int32).reshape(asked, 3) - 3
+    near = [p for p in there if any(max(abs(p[k] - b[k]) for k in range(3)) <= 1 for b in block)]
+    assert len(known) == len(there)
+    assert known.around(block).tolist() == sorted(bs.block_key(*p) for p in near)
+
+
+def test_a_set_of_keys_grows() -> None:
+    known = KeySet()
+    keys = [bs.block_key(k, -k, k % 7) for k in range(3000)]
+    for key in keys:
+        known.add(key)
+    for key in keys[::2]:
+        known.remove(key)
+    assert len(known) == 1500 and all((key in known) == bool(k % 2) for k, key in enumerate(keys))
+
+
 def test_nothing_goes_while_there_is_room(tmp_path: Path) -> None:
     mapper = _scene(tmp_path)
     mapper.pager.make_room(10_000)
@@ -173,6 +219,7 @@ def test_waiting_and_lately_seen_blocks_stay(tmp_path: Path) -> None:
     mapper.store.block[:, bs.CHANGED] = 0  # as if all had been told
     mapper.pager.make_room(mapper.stamp, busy_frames=20)
     assert mapper.pager.paged_out > 0
+    assert mapper.pager.paged_out <= MOST_OUT or mapper.pager.fill() < 0.93, "no frame pays for many"
     assert mapper.mesher.waiting == waiting
     resident = mapper.store.block[mapper.pager.resident()]
     gone = [mapper.pager.file.get(k).block[0, 0] for k in mapper.pager.file.keys().tolist()]
