@@ -37,7 +37,8 @@ from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.odometry.local_map import LocalMap
 from artemis_edge.paging import read_pages
 from artemis_edge.segmentation.keyframes import read_keyframes
-from artemis_edge.service.mapper import LiveMapper, MapperTask
+from artemis_edge.service.mapper import LiveMapper
+from artemis_edge.service.mapper_task import MapperTask
 from artemis_edge.session import feed
 from artemis_edge.session.line_channel import LineChannel
 from artemis_edge.session.message_ring import MessageRing

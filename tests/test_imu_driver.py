@@ -151,7 +151,7 @@ class ScriptedVectorNav:
         self.registers = {3: "0100012345", 5: str(baud), 6: "14", 75: "0,0,0"}
         self._out = bytearray(bytes.fromhex("fa01080093502e42833ef13f48b504bb9288"))
 
-    def chunk(self) -> bytes:
+    def chunk(self, timeout_s: float = 0.0) -> bytes:
         if not self._out:
             time.sleep(0.001)
         data = bytes(self._out)

@@ -18,7 +18,6 @@ from artemis_drivers.livox_avia.payloads import Broadcast, encode_utc
 from artemis_drivers.livox_avia.protocol import Frame, General, Kind, Lidar, WorkState, decode, encode
 from artemis_drivers.livox_avia.settings import AviaConfig, StoredExtrinsic
 from artemis_drivers.livox_host import LivoxHost
-from artemis_drivers.livox_slots import collect
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import Interface, interfaces, open_udp, port_holder, receive_buffer_warning
 from artemis_drivers.virtual.wire_avia import Faults, VirtualAvia
@@ -28,6 +27,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import livox_ports
+from tests.livox_clouds import window, xyz
 from tests.waiting import until
 
 MS = 1_000_000
@@ -103,10 +103,10 @@ def test_session_configuration_and_data() -> None:
         got = points.read()[1]
         assert set(got["data_type"].tolist()) == {4} and points.lost == imu.lost == 0
         assert (got["rx_ns"] > start).all() and (np.diff(got["rx_ns"]) >= 0).all()
-        cloud = collect(got, 0, int(got["stamp_ns"][-1]) + SECOND)
+        cloud = window(got, 0, int(got["stamp_ns"][-1]) + SECOND)
         sent = next(steady_shots(start, 0.01, 2))
-        np.testing.assert_allclose(cloud.xyz[:4800], sent.xyz.reshape(-1, 3), atol=6e-4)
-        np.testing.assert_array_equal(cloud.reflectivity[:4800], sent.reflectivity.ravel())
+        np.testing.assert_allclose(xyz(cloud)[:4800], sent.xyz.reshape(-1, 3), atol=6e-4)
+        np.testing.assert_allclose(cloud["intensity"][:4800] * 255, sent.reflectivity.ravel(), rtol=1e-6)
         samples = imu.read()[1]
         np.testing.assert_allclose(samples["accel"], [[0, 0, 9.80665]] * 40, rtol=1e-6)
         assert np.diff(samples["stamp_ns"]).tolist() == [5 * MS] * 39
@@ -128,7 +128,7 @@ def test_other_data_types_on_the_wire(mode: str, coordinate: str, data_type: int
         assert set(got["data_type"].tolist()) == {data_type}
         sent = next(steady_shots(0, 0.01, 3)).xyz.reshape(-1, 3)
         np.testing.assert_allclose(
-            collect(got, 0, 10**12 + int(got["stamp_ns"][0])).xyz[:7200], sent, atol=2e-3
+            xyz(window(got, 0, 10**12 + int(got["stamp_ns"][0])))[:7200], sent, atol=2e-3
         )
 
 

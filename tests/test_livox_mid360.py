@@ -15,7 +15,7 @@ from artemis_drivers.livox_mid360 import encode, protocol
 from artemis_drivers.livox_mid360.points import Decoder
 from artemis_drivers.livox_mid360.protocol import Cmd, Found, Frame, HostAddress, Key
 from artemis_drivers.livox_mid360.settings import Mid360Config
-from artemis_drivers.livox_slots import IMU_SLOT, POINT_SLOT, collect
+from artemis_drivers.livox_slots import IMU_SLOT, POINT_SLOT
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import PACKET
 from artemis_drivers.virtual.wire_avia import VirtualAvia
@@ -25,6 +25,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests import livox_ports
+from tests.livox_clouds import window, xyz
 from tests.waiting import until
 
 MS = 1_000_000
@@ -217,7 +218,7 @@ def test_session(monkeypatch: pytest.MonkeyPatch) -> None:
             assert health.counters["points_lost"] == health.counters["imu_lost"] == 0
             assert health.counters["imu_packets"] == 60 and health.counters["packets_foreign"] == 0
             got = RingReader(driver.lidars[0].points, from_oldest=True).read()[1]
-            np.testing.assert_allclose(collect(got, 0, PERIOD).xyz, metres(records(1, 0), 1), atol=1e-5)
+            np.testing.assert_allclose(xyz(window(got, 0, PERIOD)), metres(records(1, 0), 1), atol=1e-5)
             assert until(lambda: driver.health()[0].identity["firmware"] == "13.18.02.37")
             driver.lidars[0].send_utc(1_700_000_000 * 10**9)
             assert until(lambda: driver.health()[0].status["sync"] == "gps")

@@ -16,15 +16,18 @@ from artemis_drivers.livox_slots import (
     NEW,
     POINT_SLOT,
     TRACK,
-    Cloud,
     collect,
     days_of,
     track,
 )
+from artemis_drivers.packing import joined_bytes
 from artemis_drivers.ring import Ring, RingReader
-from artemis_drivers.udp import PACKET, joined_bytes, packet_bytes
+from artemis_drivers.udp import PACKET, packet_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from artemis_edge.session.writer import POINT
+from tests.livox_clouds import window
 
 TYPES = [2, 3, 4, 5, 7, 8]
 MS = 1_000_000
@@ -319,21 +322,17 @@ def test_track_by_itself() -> None:
 # -- windows ----------------------------------------------------------------------------------------------------
 
 
-def naive_window(got: Slots, start: int, end: int) -> Cloud:
-    rows, empty = [], 0
-    for k in range(len(got["stamp_ns"])):
-        for i in range(got["filled"][k]):
-            shot = i // int(got["returns"][k])
-            t = got["stamp_ns"][k] - start + shot * float(got["shot_ns"][k])
-            if 0 <= t < end - start:
-                if not got["xyz"][k, i].any():
-                    empty += 1
-                    continue
-                rows.append(
-                    (*got["xyz"][k, i], t * 1e-9, got["reflectivity"][k, i], got["tag"][k, i], shot % 6)
-                )
-    a = np.array(rows).reshape(-1, 7)
-    return Cloud(a[:, :3], a[:, 3], a[:, 4], a[:, 5], a[:, 6], empty)
+def naive_window(batches: list[tuple[Slots, int]], start: int, end: int) -> list[tuple[float, ...]]:
+    rows = []
+    for got, offset in batches:
+        for k in range(len(got["stamp_ns"])):
+            for i in range(got["filled"][k]):
+                shot = i // int(got["returns"][k])
+                t = got["stamp_ns"][k] + offset - start + shot * float(got["shot_ns"][k])
+                if 0 <= t < end - start and got["xyz"][k, i].any():
+                    about = got["reflectivity"][k, i] / 255, got["tag"][k, i], shot % 6, round(t)
+                    rows.append((*got["xyz"][k, i], *about))
+    return rows
 
 
 @pytest.mark.parametrize("kind", TYPES)
@@ -348,21 +347,23 @@ def test_window_of_points(kind: int) -> None:
         body[::5] = 0
         packets.append((k, encode.header(0, 0, kind, k * period) + body.tobytes()))
     got = slots(feed(packets).points)
+    batches = [
+        ({name: rows[:2] for name, rows in got.items()}, 0),
+        ({n: rows[2:] for n, rows in got.items()}, 5000),
+    ]
     for start, end in ((0, 6 * period), (period // 2, 4 * period + 777), (7 * period, 8 * period), (50, 50)):
-        ours, plain = collect(got, start, end), naive_window(got, start, end)
-        assert ours.no_return == plain.no_return
-        for a, b in zip(ours[:5], plain[:5], strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-6)
-    both = [collect(got, *w) for w in ((0, 3 * period + 999), (3 * period + 999, 6 * period))]
-    whole = collect(got, 0, 6 * period)
-    assert (
-        sum(len(c.xyz) for c in both) == len(whole.xyz) and sum(c.no_return for c in both) == whole.no_return
-    )
+        ours, plain = collect(batches, start, end, POINT), naive_window(batches, start, end)
+        assert len(ours) == len(plain)
+        np.testing.assert_allclose(
+            np.array(ours.tolist()).reshape(-1, 7), np.array(plain).reshape(-1, 7), rtol=1e-6
+        )
+    both = [window(got, *w) for w in ((0, 3 * period + 999), (3 * period + 999, 6 * period))]
+    assert sum(map(len, both)) == len(window(got, 0, 6 * period))
 
 
 def test_window_of_nothing() -> None:
-    cloud = collect(slots(Ring(feed([]).points.dtype, 4)), 0, 10**9)
-    assert cloud.xyz.shape == (0, 3) and cloud.no_return == 0
+    nothing = slots(Ring(feed([]).points.dtype, 4))
+    assert len(window(nothing, 0, 10**9)) == len(collect([], 0, 10**9, POINT)) == 0
 
 
 def test_raw_packets_stay_readable() -> None:

@@ -133,3 +133,19 @@ def test_concurrent_producer_never_tears_a_slot() -> None:
         seen += n
     thread.join()
     assert seen + reader.lost == total
+
+
+@given(st.integers(1, 6), st.lists(st.integers(0, 15), max_size=8))
+@settings(max_examples=100, deadline=None)
+def test_extending_is_appending_many_times(slots: int, counts: list[int]) -> None:
+    many, one = Ring(SLOT, slots), Ring(SLOT, slots)
+    number = 0
+    for count in counts:
+        rows = [(number + k, np.full((3, 2), number + k), (number + k) % 251) for k in range(count)]
+        many.extend(rows)
+        for row in rows:
+            one.append(dict(zip(SLOT.names or (), row, strict=True)))
+        number += count
+    assert many.published == one.published == number and many.oldest() == one.oldest()
+    for name in SLOT.names or ():
+        np.testing.assert_array_equal(many.field[name], one.field[name])

@@ -2,12 +2,15 @@
 
 import multiprocessing
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
+from textual.geometry import Region, Size
 from textual.pilot import Pilot
 from textual.widgets import DataTable, Input, Static
 
@@ -15,10 +18,11 @@ from artemis_edge import check
 from artemis_edge.check_finding import Finding
 from artemis_edge.commands.tui import read_keys
 from artemis_edge.errors import InputError
+from artemis_edge.frames import MeshDelta
 from artemis_edge.newest import Newest, joined
 from artemis_edge.status import QueryStatus, Status
 from artemis_edge.tui import app as app_module
-from artemis_edge.tui import jobs, pages
+from artemis_edge.tui import jobs, pages, picture, widgets
 from artemis_edge.tui.app import ArtemisTui, LivePage
 from artemis_edge.tui.child import Teller
 from artemis_edge.tui.history import History
@@ -439,3 +443,77 @@ def test_the_demos_child_tells_and_hears() -> None:
     ours.close()
     assert left.wait(5.0), "without a terminal the demo ends"
     theirs.close()
+
+
+def test_a_question_is_looked_for_again_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    copy, now = MapCopy(), [0.0]
+    find = picture.Finder(copy, lambda: now[0])
+    query = QueryStatus("bench", labels=[3])
+    copy.apply(_patch((0.0, 0.0, 0.0), label=3))
+    assert find(query).count == 1 and find(query) == picture.found_in(copy, query)
+    copy.apply(_patch((9.0, 0.0, 0.0), label=3))
+    assert find(query).count == 1, "the map has changed, but just now"
+    now[0] = 1.0
+    assert find(query).count == 2
+    copy.apply(_patch((18.0, 0.0, 0.0), label=4))
+    assert find(replace(query, labels=[4])).count == 1, "another question does not wait"
+    monkeypatch.setattr(picture, "found_in", None)  # nothing is looked for while the map stays
+    now[0] = 9.0
+    assert find(replace(query, labels=[4])).count == 1
+
+
+def _patch(at: tuple[float, float, float], label: int) -> MeshDelta:
+    """A block of vertices that lie together."""
+    return delta((int(at[0]), 0, 0), np.tile(at, (30, 1)), label)
+
+
+def test_only_lines_that_change_are_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    monkeypatch.setattr(widgets.MeshPicture, "refresh", lambda self, *regions, **_: drawn.append(regions))
+    monkeypatch.setattr(widgets.MeshPicture, "size", Size(6, 4))
+    for colour in (True, False):
+        shown = widgets.MeshPicture(colour)
+        image = np.random.default_rng(1).integers(0, 255, (8, 6, 3)).astype(np.uint8)
+        shown.show(image)
+        changed = image.copy()
+        changed[5, 2] = (255, 255, 255)
+        drawn.clear()
+        shown.show(changed)
+        assert drawn == [(Region(0, 2, 6, 1),)]
+        whole = widgets.MeshPicture(colour)
+        whole.show(changed)
+        assert [s.text for s in shown._lines] == [s.text for s in whole._lines]
+        assert [list(s) for s in shown._lines] == [list(s) for s in whole._lines]
+        drawn.clear()
+        shown.show(changed.copy())
+        assert drawn == []
+        shown.caption = "from above"
+        shown.show(changed)
+        assert drawn == [()], "all of it"
+
+
+def test_nothing_is_drawn_while_nothing_changes(tmp_path: Path) -> None:
+    app, drawn = ArtemisTui(Fake(), tmp_path), list[str]()
+
+    async def script(pilot: Pilot[None]) -> None:
+        await settled(pilot, lambda: live(app).query_one("#queries", DataTable).row_count == 2)
+        page, told = live(app), app._remote.status()
+        page.redraw()
+        for part in page.walk_children(with_self=False):
+            part.refresh = partial(_note, drawn, type(part).__name__)  # type: ignore[method-assign]
+        for _ in range(3):
+            page.show(told)
+            page.redraw()
+        assert drawn == []
+        page.show(replace(told, frames=told.frames + 1))
+        assert set(drawn) == {"Gauges"}
+        streams = [*told.streams[:1], replace(told.streams[1], hz=7.0), *told.streams[2:]]
+        page.show(replace(told, frames=told.frames + 1, streams=streams))
+        assert set(drawn) == {"Gauges", "Streams"}
+        assert page.query_one("#streams", DataTable).get_row_at(1)[1].plain == "7/10"
+
+    run(app, script, (100, 30))
+
+
+def _note(drawn: list[str], name: str, *regions: object, **words: object) -> None:
+    drawn.append(name)

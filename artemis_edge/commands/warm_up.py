@@ -19,12 +19,18 @@ def run(given: argparse.Namespace) -> int:
     import tempfile
     from pathlib import Path
 
+    from artemis_drivers.livox import livox_driver
+    from artemis_drivers.livox_avia.settings import AviaConfig
+    from artemis_drivers.livox_mid360.settings import Mid360Config
+
     from artemis_edge._jit import cache_dir
     from artemis_edge.config import Config
     from artemis_edge.progress import say
+    from artemis_edge.service.capture import warm_up as warm_up_devices
     from artemis_edge.session.stream_mapping import warm_up
 
     say("compiling for this machine (once for a version; a minute or two)")
+    warm_up_devices(livox_driver([AviaConfig()], [Mid360Config()]).lidars)
     with tempfile.TemporaryDirectory(prefix="artemis-warm-up-") as folder:
         seconds = warm_up(Config(), Path(folder) / "map", questions=True)
     print(f"ready after {seconds:.0f} s; kept in {cache_dir()}")

@@ -9,17 +9,19 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from artemis_drivers.base import Health, State
 from artemis_drivers.camera.driver import Camera
 from artemis_drivers.camera.frames import CameraFrame, take
-from artemis_drivers.livox_slots import Cloud
+from artemis_drivers.livox_host import LivoxLidar
+from artemis_drivers.packing import joined_bytes
 from artemis_drivers.ring import RingReader
 from artemis_drivers.trigger.events import Kind
 from artemis_drivers.trigger.messages import Opcode
-from artemis_drivers.udp import joined_bytes
+from numpy.typing import NDArray
 
 from artemis_edge import topics
 from artemis_edge.frame_pairing import CameraTiming, FrameStamp
@@ -29,7 +31,7 @@ from artemis_edge.service.rig import Rig
 from artemis_edge.service.scans import WINDOW_NS, ScanCutter
 from artemis_edge.service.watch import DeviceWatch
 from artemis_edge.session.messages import CameraExposure, CompressedImage, Header, Image, Imu, ImuTemplate
-from artemis_edge.session.writer import cloud_message
+from artemis_edge.session.writer import structured_cloud
 from artemis_edge.session_clocks import epoch_of
 from artemis_edge.sync import BoardEvent, ImageTime, Synchroniser
 
@@ -49,6 +51,14 @@ _STEPS = {"mono8": 1, "bgr8": 3, "rgb8": 3, "bayer_rggb8": 1}
 _FILES = ("jpeg", "png")
 
 
+def warm_up(lidars: Sequence[LivoxLidar]) -> None:
+    """Have the kernels compiled that take in what these deliver."""
+    for lidar in lidars:
+        lidar.decoder.warm_up()
+        ScanCutter(lidar).cut(0)
+    joined_bytes({"size": np.empty(0), "data": np.empty((0, 1))})
+
+
 class Capture:
     """The thread. ``sync`` is None until the first pulse; ``turn_s`` is when the last turn was, for the watchdog."""
 
@@ -62,6 +72,7 @@ class Capture:
         self.buttons: list[int] = []
         self.fault: BaseException | None = None
         config = rig.config
+        warm_up(rig.livox.lidars)
         self._cutters = [ScanCutter(lidar) for lidar in rig.livox.lidars]
         self._imu = RingReader(rig.imu_samples) if rig.imu_samples is not None else None
         self._events = RingReader(rig.events) if rig.events is not None else None
@@ -125,7 +136,8 @@ class Capture:
 
     def _run(self) -> None:
         try:
-            while not self._stop.wait(_TURN_S):
+            while not self._stop.is_set():
+                time.sleep(_TURN_S)  # to wait for the event with a limit costs three times as much
                 self._turn()
             self._turn()
         except BaseException as fault:
@@ -372,19 +384,11 @@ class Capture:
         if lost:
             self.outlet.say(topics.LOST.name, lost)
         for number in reversed(range(len(clouds))):  # the primary last: it completes the frame
-            if number == 0 or len(clouds[number].xyz):
+            if number == 0 or len(clouds[number]):
                 self._send_cloud(number, start, clouds[number])
 
-    def _send_cloud(self, number: int, start: int, cloud: Cloud) -> None:
-        message = cloud_message(
-            start,
-            cloud.xyz,
-            cloud.reflectivity.astype(np.float32) / np.float32(255.0),
-            tag=cloud.tag,
-            line=cloud.line,
-            offset_ns=np.rint(cloud.offset_s.astype(np.float64) * 1e9).astype(np.uint32),
-            frame_id=lidar_frame(self.rig.config, number),
-        )
+    def _send_cloud(self, number: int, start: int, cloud: NDArray[np.void]) -> None:
+        message = structured_cloud(start, cloud, lidar_frame(self.rig.config, number))
         self.outlet.send(lidar_topic(number), message, start)
 
     def _losses(self) -> Counter[str]:

@@ -376,6 +376,7 @@ class Daemon:
             "events": self._marks.events,
             "queries": msgspec.to_builtins(self._questions()),
             "cpu_s": round(time.process_time(), 2),
+            "threads_cpu_s": {name: round(s, 3) for name, s in health.cpu_by_thread_s().items()},
         }
 
     def _told(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from artemis_edge.orphans import adopt_orphans
 from artemis_edge.service import settings
 from artemis_edge.service.children import Child
 from artemis_edge.service.control import control_path, viewers_path
-from artemis_edge.service.mapper import MapperTask
+from artemis_edge.service.mapper_task import MapperTask
 from artemis_edge.service.outlet import Outlet, rig_topics
 from artemis_edge.service.overload import Machine, OverloadControl
 from artemis_edge.service.questions import Restarts

@@ -18,7 +18,6 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from msgspec import Struct
 
 from artemis_edge import health
 from artemis_edge.config import Config, from_toml
@@ -28,6 +27,7 @@ from artemis_edge.loop.relocate import Found
 from artemis_edge.orphans import end_with_the_parent
 from artemis_edge.service.checkpoint import Checkpoints
 from artemis_edge.service.map_feed import MapFeed
+from artemis_edge.service.mapper_task import MapperTask
 from artemis_edge.session.feed import LiveFeed
 from artemis_edge.session.late_masks import LateMasks
 from artemis_edge.session.line_channel import LineChannel
@@ -41,25 +41,6 @@ _SAY_S = 0.25
 _COLLECT_EVERY = 100  # frames
 _LATEST = 50  # frames that times are told of
 _EARLY = 300  # frames after which it is too late to hold still at the start
-
-
-class MapperTask(Struct, frozen=True):
-    """What the service tells the mapping: ``config`` as TOML, the session's folder, where the map goes.
-
-    ``viewers`` is the path of the socket for viewers of the growing mesh (empty: none), with its file mode.
-    ``earlier`` is where a map may be that this one is to continue (empty: none).
-    With ``questions`` the map has classes.
-    """
-
-    folder: str
-    out: str
-    first: int = 0
-    config: str = ""
-    checkpoint_s: float = 20.0
-    viewers: str = ""
-    viewers_mode: int = 0o600
-    earlier: str = ""
-    questions: bool = False
 
 
 class LiveMapper:

@@ -63,7 +63,7 @@ class Outlet:
         now = time.monotonic_ns() if rx_ns is None else rx_ns
         self.send(topic, Text(json.dumps(value)), now + self.wall_ns, rx_ns)
 
-    def raw(self, topic: str, device: str, rx_ns: Any, ids: Any, sizes: Any, data: bytes) -> None:
+    def raw(self, topic: str, device: str, rx_ns: Any, ids: Any, sizes: Any, data: Buffer) -> None:
         """What a device sent."""
         if self.is_open and len(rx_ns):
             last = int(rx_ns[-1])

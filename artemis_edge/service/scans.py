@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 from artemis_drivers.livox_avia.status import has_pulse
 from artemis_drivers.livox_host import LivoxLidar
-from artemis_drivers.livox_slots import Cloud, collect
+from artemis_drivers.livox_slots import Slots, collect
 from artemis_drivers.ring import RingReader
 from numpy.typing import NDArray
 
+from artemis_edge.session.writer import POINT
 from artemis_edge.session_clocks import LidarClock
 from artemis_edge.sync import Synchroniser
 
 WINDOW_NS = 100_000_000
 _MOST_PENDING = 64  # batches: seconds of data while time is not known yet
 _CLOCKS = {int(clock) for clock in LidarClock}
-
-Slots = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,6 @@ class ScanCutter:
         self._points, self._imu = RingReader(lidar.points), RingReader(lidar.imu)
         self._batches: deque[_Batch] = deque()
         self._offset_ns: int | None = None
-        self.cut(0)  # has the kernel compiled before the first packet
 
     @property
     def overwritten(self) -> int:
@@ -79,21 +77,18 @@ class ScanCutter:
         columns = slots["rx_ns"], slots["gyro"].astype(np.float64), slots["accel"].astype(np.float64)
         return list(zip(stamps, *(column.tolist() for column in columns), strict=True))
 
-    def cut(self, start_ns: int) -> Cloud:
-        """The points of the window from ``start_ns`` on; what is older is dropped."""
+    def cut(self, start_ns: int) -> NDArray[np.void]:
+        """The points (n,) of dtype POINT of the window from ``start_ns`` on; what is older is dropped."""
         end = start_ns + WINDOW_NS
         parts = [
-            _wanted(batch, start_ns, end)
+            (batch.slots, batch.offset_ns)
             for batch in self._batches
             if batch.end_ns > start_ns and batch.first_ns < end
         ]
         while self._batches and self._batches[0].end_ns <= end:
             self._batches.popleft()
-        if not parts:
-            empty = {name: array[:0] for name, array in self.lidar.points.field.items()}
-            return collect(empty, 0, 1)
-        slots = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return collect(slots, start_ns, end)
+        nothing = {name: array[:0] for name, array in self.lidar.points.field.items()}
+        return collect(parts or [(nothing, 0)], start_ns, end, POINT)
 
     def _date(self, sync: Synchroniser, slots: Slots) -> int | None:
         """What is added to device time: by the last packet of the batch."""
@@ -105,11 +100,3 @@ class ScanCutter:
         if dated is None:
             return None
         return dated.stamp_ns - stamp
-
-
-def _wanted(batch: _Batch, start_ns: int, end_ns: int) -> Slots:
-    """Slots that may hold points of the window, in session time."""
-    stamps = batch.slots["stamp_ns"] + batch.offset_ns
-    keep = (stamps < end_ns) & (stamps > start_ns - WINDOW_NS)
-    slots = {name: array[keep] for name, array in batch.slots.items()}
-    return {**slots, "stamp_ns": stamps[keep]}

@@ -118,28 +118,29 @@ class Ros1Reader(CdrReader):
 
 
 class CdrWriter:
-    """Writes primitives, little-endian."""
+    """Writes primitives, little-endian. Large parts are copied once, when the message is finished."""
 
     def __init__(self) -> None:
-        self._body = bytearray()
+        self._parts: list[Buffer] = [_LITTLE_HEADER]
+        self._size = 0
 
     def write(self, code: str, value: float | bool) -> None:
         """One primitive by its ``struct`` code."""
         layout = _LITTLE[code]
         self._pad(layout.size)
-        self._body += layout.pack(value)
+        self.octets(layout.pack(value))
 
     def string(self, text: str) -> None:
         """A string."""
         encoded = text.encode()
         self.write("I", len(encoded) + 1)
-        self._body += encoded + b"\0"
+        self.octets(encoded + b"\0")
 
     def array(self, code: str, values: NDArray[Any]) -> None:
         """Primitives without a count."""
         if values.size:
             self._pad(_LITTLE[code].size)
-            self._body += np.ascontiguousarray(values, "<" + code).tobytes()
+            self.octets(np.ascontiguousarray(values, "<" + code).reshape(-1).view(np.uint8).data)
 
     def sequence(self, code: str, values: NDArray[Any]) -> None:
         """A counted array."""
@@ -147,12 +148,14 @@ class CdrWriter:
         self.array(code, values)
 
     def octets(self, data: Buffer) -> None:
-        """Bytes without a count."""
-        self._body += data
+        """Bytes without a count; they must not change before ``finish``."""
+        self._parts.append(data)
+        self._size += len(data)
 
     def finish(self) -> bytes:
         """The message with its header."""
-        return _LITTLE_HEADER + self._body
+        return b"".join(self._parts)
 
     def _pad(self, alignment: int) -> None:
-        self._body += bytes(-len(self._body) % alignment)
+        if missing := -self._size % alignment:
+            self.octets(bytes(missing))

@@ -378,7 +378,8 @@ def structured_cloud(stamp_ns: int, cloud: np.ndarray[Any, Any], frame_id: str) 
         for name, (dtype, offset, *_) in (cloud.dtype.fields or {}).items()
     )
     step, header = cloud.dtype.itemsize, Header(stamp_ns, frame_id)
-    return PointCloud2(header, 1, len(cloud), fields, step, cloud.nbytes, cloud.tobytes())
+    data = np.ascontiguousarray(cloud).view(np.uint8).data
+    return PointCloud2(header, 1, len(cloud), fields, step, cloud.nbytes, data)
 
 
 def _transform(stamp_ns: int, parent: str, child: str, T: F64) -> TransformStamped:

@@ -24,7 +24,7 @@ from textual.widgets import DataTable, Footer, Header, Input, Static
 from artemis_edge.status import Status
 from artemis_edge.tui.history import History
 from artemis_edge.tui.pages import ChecksPage, HelpPage, ReportPlace, SessionsPage
-from artemis_edge.tui.picture import Kind, MapCopy, draw, found_in
+from artemis_edge.tui.picture import Finder, Kind, MapCopy, draw
 from artemis_edge.tui.remote import Remote, RemoteError
 from artemis_edge.tui.widgets import Advice, FrameTimes, Gauges, MeshPicture, Queries, Streams
 
@@ -73,7 +73,9 @@ class LivePage(Screen[None]):
     def __init__(self, copy: MapCopy, colour: bool, history: History) -> None:
         super().__init__()
         self._copy, self._colour, self._history = copy, colour, history
+        self._find = Finder(copy)
         self._status = Status()
+        self._drawn: object = None  # what the picture was drawn of
         self._look_at: tuple[float, float, float] | None = None
         self._place = 0
 
@@ -103,7 +105,7 @@ class LivePage(Screen[None]):
 
     def show(self, status: Status) -> None:
         """Take over a new status."""
-        queries = [found_in(self._copy, q) for q in status.queries]
+        queries = [self._find(q) for q in status.queries]
         if status.state in ("done", "idle"):  # nobody is looking any more
             queries = [replace(q, status="not found") if q.status == "searching" else q for q in queries]
         known = status.map if status.map.vertices else replace(status.map, vertices=len(self._copy))
@@ -116,7 +118,7 @@ class LivePage(Screen[None]):
         self.query_one(Advice).show(status)
 
     def redraw(self) -> None:
-        """Draw the map as it is now."""
+        """Draw the map as it is now, where anything of it has changed."""
         picture = self.query_one(MeshPicture)
         if not self.is_current or picture.size.width == 0:
             return
@@ -127,6 +129,11 @@ class LivePage(Screen[None]):
         queries = status.queries if self._colour else [replace(q, colour=_WHITE) for q in status.queries]
         picture.message = "" if len(self._copy) else status.message or "no map yet"
         picture.caption = f"{'from above' if self.view == 'above' else 'from behind'}, {self.span_m:.0f} m"
+        seen = [(q.labels, q.boxes, q.colour) for q in queries]
+        known = (self._copy.version, picture.pixels, picture.message, picture.caption, at, status.yaw, seen)
+        if known == self._drawn:
+            return
+        self._drawn = known
         picture.show(draw(self._copy, width, height, at, status.yaw, self.view, self.span_m, queries))
 
     def action_view(self) -> None:

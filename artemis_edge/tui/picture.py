@@ -5,7 +5,8 @@ In a terminal a pixel is a decimetre or more, and vertices lie that close; trian
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,6 +27,8 @@ _TILT = np.deg2rad(35.0)  # how steeply one looks down from behind
 _BEHIND_M = 9.0
 _PIECE_M = 0.5  # vertices of a class this near to each other are one thing
 _LEAST_PIECE = 20  # fewer are a stray mask
+_AGAIN_S = 1.0
+_HALF_RANGE = 1 << 19  # cells: 262 km
 _FOV = 1.1  # focal length over half the width: 85 degrees across
 
 
@@ -37,22 +40,29 @@ class _Block:
 
 
 class MapCopy:
-    """The newest vertices of every block that was told."""
+    """The newest vertices of every block that was told; ``version`` counts how often there was news."""
 
     def __init__(self) -> None:
+        self.version = 0
         self._blocks: dict[tuple[int, int, int], _Block] = {}
         self._merged: _Block | None = None
+        self._vertices = 0
 
     def apply(self, delta: MeshDelta) -> None:
         """Take over the blocks of a delta."""
+        position, label = delta.position.copy(), delta.label.copy()
+        shaded, ends = _shaded(delta.colour, delta.normal), delta.vertex_start.tolist()
         for k, block in enumerate(delta.block.tolist()):
-            rows = slice(int(delta.vertex_start[k]), int(delta.vertex_start[k + 1]))
-            shaded = _shaded(delta.colour[rows], delta.normal[rows])
-            self._blocks[tuple(block)] = _Block(delta.position[rows].copy(), shaded, delta.label[rows].copy())
+            rows, place = slice(ends[k], ends[k + 1]), tuple(block)
+            if (before := self._blocks.get(place)) is not None:
+                self._vertices -= len(before.label)
+            self._blocks[place] = _Block(position[rows], shaded[rows], label[rows])
+            self._vertices += ends[k + 1] - ends[k]
         self._merged = None
+        self.version += 1
 
     def __len__(self) -> int:
-        return sum(len(block.label) for block in self._blocks.values())
+        return self._vertices
 
     def points(self) -> tuple[F32, U8, U8]:
         """Positions (n, 3), colours (n, 3) and labels (n,), thinned evenly to ``MOST_VERTICES``."""
@@ -90,13 +100,46 @@ def found_in(copy: MapCopy, query: QueryStatus) -> QueryStatus:
         return query
     points, _, label = copy.points()
     rows = points[np.isin(label, query.labels)]
-    cells, count = np.unique(np.floor(rows / _PIECE_M).astype(np.int64), axis=0, return_counts=True)
-    image = {tuple(c): int(n) for c, n in zip(cells.tolist(), count.tolist(), strict=True)}
-    places = [
-        _middle(rows, piece) for piece in _pieces(image) if sum(image[c] for c in piece) >= _LEAST_PIECE
-    ]
+    places = _places(rows)
     status = query.status if places else "searching"
     return replace(query, count=len(places), places=places, status=status)
+
+
+class Finder:
+    """``found_in`` for the questions of a page; where only the map has changed not more than once a second."""
+
+    def __init__(self, copy: MapCopy, clock: Callable[[], float] = time.monotonic) -> None:
+        self._copy, self._clock = copy, clock
+        self._known: dict[str, tuple[list[int], int, float, QueryStatus]] = {}
+
+    def __call__(self, query: QueryStatus) -> QueryStatus:
+        """The question with its pieces, as they were a second ago at the oldest."""
+        if not query.labels or query.places:
+            return query
+        version, now = self._copy.version, self._clock()
+        labels, seen, at_s, found = self._known.get(query.text, ([], -1, 0.0, query))
+        if labels != query.labels or (seen != version and now - at_s >= _AGAIN_S):
+            found = found_in(self._copy, query)
+            self._known[query.text] = (query.labels, version, now, found)
+        status = query.status if found.places else "searching"
+        return replace(query, count=found.count, places=found.places, status=status)
+
+
+def _places(rows: F32) -> list[tuple[float, float, float]]:
+    """The middle of each piece that points (n, 3) make, the largest piece first."""
+    cells = np.floor(rows / _PIECE_M).astype(np.int64)
+    _, first, own, count = np.unique(_code(cells), return_index=True, return_inverse=True, return_counts=True)
+    corners = [tuple(cell) for cell in cells[first].tolist()]
+    image = dict(zip(corners, count.tolist(), strict=True))
+    number = {cell: k for k, cell in enumerate(corners)}
+    places = []
+    for piece in _pieces(image):
+        if sum(image[cell] for cell in piece) >= _LEAST_PIECE:
+            chosen = np.zeros(len(corners), np.bool_)
+            chosen[[number[cell] for cell in piece]] = True
+            x, y, z = rows[chosen[own]].mean(axis=0).tolist()
+            places.append((x, y, z))
+    return places
 
 
 def _pieces(cells: dict[tuple[int, ...], int]) -> list[list[tuple[int, ...]]]:
@@ -116,14 +159,9 @@ def _pieces(cells: dict[tuple[int, ...], int]) -> list[list[tuple[int, ...]]]:
     return sorted(found, key=lambda piece: (-len(piece), piece[0]))
 
 
-def _middle(rows: F32, piece: list[tuple[int, ...]]) -> tuple[float, float, float]:
-    own = np.isin(_code(np.floor(rows / _PIECE_M)), _code(np.array(piece, np.float64)))
-    x, y, z = rows[own].mean(axis=0).tolist()
-    return x, y, z
-
-
-def _code(cells: F64 | F32) -> F64:
-    code: F64 = np.asarray(cells, np.float64) @ np.array([1e8, 1e4, 1.0])
+def _code(cells: I64) -> I64:
+    """One number of each cell (n, 3), in the order of x, y, z; cells are within half a million of the origin."""
+    code: I64 = (cells + _HALF_RANGE) @ np.array([1 << 40, 1 << 20, 1])
     return code
 
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
+from rich.color import Color
 from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
-from textual.app import RenderResult
+from textual.coordinate import Coordinate
+from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 from textual.widgets import DataTable, Static
 from textual.widgets.data_table import ColumnKey
 
 from artemis_edge.frames import U8
-from artemis_edge.status import QueryStatus, Status
+from artemis_edge.status import QueryStatus, Status, Stream
 from artemis_edge.tui.picture import luminance_text
 
 BUDGET_MS = 100.0  # a frame of a LiDAR at 10 Hz
 _BARS = "▁▂▃▄▅▆▇█"
 _HALF = "▀"
 _WIDE = 45  # characters of a table that has room for reasons
+_STYLES = 1 << 14  # pairs of colours remembered: a picture has some hundred, the next one much the same
 _LOW_MINUTES, _LEAST_MINUTES = 15.0, 5.0
 
 
@@ -34,6 +39,8 @@ class MeshPicture(Widget):
         super().__init__(id=id)
         self._colour = colour
         self._lines: list[Strip] = []
+        self._shown: U8 = np.empty((0, 0, 3), np.uint8)
+        self._said: tuple[str, str] = ("", "")
         self.caption = ""
         self.message = ""
 
@@ -43,12 +50,28 @@ class MeshPicture(Widget):
         return max(self.size.width, 1), max(self.size.height, 1) * 2
 
     def show(self, image: U8) -> None:
-        """Take over a picture uint8 (h, w, 3); h is even."""
+        """Take over a picture uint8 (h, w, 3), h is even; only lines that have changed are drawn again."""
+        shown, said = self._shown, (self.caption, self.message)
+        changed = np.ones(len(image) // 2, np.bool_)
+        if shown.shape == image.shape and said == self._said:
+            changed = (image != shown).reshape(len(changed), -1).any(axis=1)
+        self._shown, self._said = image, said
+        rows = np.flatnonzero(changed).tolist()
+        if len(rows) == len(changed):
+            self._lines = self._drawn(image, rows)
+            self.refresh()
+            return
+        for row, line in zip(rows, self._drawn(image, rows), strict=True):
+            self._lines[row] = line
+            self.refresh(Region(0, row, self.size.width, 1))
+
+    def _drawn(self, image: U8, rows: Sequence[int]) -> list[Strip]:
+        """Lines of characters, each of two rows of pixels."""
         if self._colour:
-            self._lines = [_strip(image[r], image[r + 1]) for r in range(0, len(image) - 1, 2)]
-        else:
-            self._lines = [Strip([Segment(line)]) for line in luminance_text(image)]
-        self.refresh()
+            return [_strip(image[2 * r], image[2 * r + 1]) for r in rows]
+        pairs = image[: len(image) // 2 * 2].reshape(-1, 2, *image.shape[1:])[rows]
+        text = luminance_text(pairs.reshape(-1, *image.shape[1:]))
+        return [Strip([Segment(line)]) for line in text]
 
     def render_line(self, y: int) -> Strip:
         """One line of characters."""
@@ -73,28 +96,63 @@ def _strip(top: U8, bottom: U8) -> Strip:
     """Runs of equal colours become one segment: a line is some tens of them, not hundreds."""
     pair = np.concatenate((top, bottom), axis=1).astype(np.int64)
     ends = np.flatnonzero(np.concatenate(((pair[1:] != pair[:-1]).any(axis=1), [True]))) + 1
-    start, segments = 0, []
-    for end in ends.tolist():
-        r, g, b, r2, g2, b2 = pair[start].tolist()
-        style = Style.from_color(_rgb(r, g, b), _rgb(r2, g2, b2))
-        even = (r, g, b) == (r2, g2, b2)
-        segments.append(Segment((" " if even else _HALF) * (end - start), style))
-        start = end
+    lengths = np.diff(ends, prepend=0).tolist()
+    segments = [
+        Segment((" " if colours[:3] == colours[3:] else _HALF) * length, _style(tuple(colours)))
+        for colours, length in zip(pair[ends - 1].tolist(), lengths, strict=True)
+    ]
     return Strip(segments, len(pair))
 
 
-def _rgb(r: int, g: int, b: int):  # type: ignore[no-untyped-def]
-    from rich.color import Color
+@lru_cache(_STYLES)
+def _style(colours: tuple[int, ...]) -> Style:
+    """Of a half block: red, green, blue above and below. A style that is met again knows its escape codes."""
+    return Style.from_color(Color.from_rgb(*colours[:3]), Color.from_rgb(*colours[3:]))
 
-    return Color.from_rgb(r, g, b)
+
+class Sentence(Static):
+    """Text that is drawn again only where it says something else: to lay out and draw a page takes milliseconds."""
+
+    fixed_size = True
+    _latest = Text("")
+
+    def tell(self, text: Text) -> None:
+        """Show ``text``; with ``fixed_size`` the page stays laid out as it is."""
+        if not _same(text, self._latest):
+            self._latest = text
+            self.update(text, layout=not self.fixed_size)
 
 
-class FrameTimes(Static):
+class Rows(DataTable[Text]):
+    """A table of which only those cells are drawn again that have changed."""
+
+    _filled: Sequence[tuple[str, list[Text]]] = ()
+
+    def fill(self, rows: Sequence[tuple[str, list[Text]]]) -> None:
+        """Show rows: a key and the cells of each."""
+        before, self._filled = self._filled, rows
+        if [key for key, _ in before] != [key for key, _ in rows]:
+            self.clear()
+            for key, cells in rows:
+                self.add_row(*cells, key=key)
+            return
+        for r, ((_, old), (_, new)) in enumerate(zip(before, rows, strict=True)):
+            for c, (was, cell) in enumerate(zip(old, new, strict=True)):
+                if not _same(was, cell):
+                    self.update_cell_at(Coordinate(r, c), cell)
+
+
+def _same(a: Text, b: Text) -> bool:
+    """Rich does not compare the style of the whole."""
+    return a == b and a.style == b.style
+
+
+class FrameTimes(Sentence):
     """A sparkline of the latest frames' times against the 100 ms line."""
 
     def show(self, status: Status) -> None:
         """Redraw for a status."""
-        self.update(frame_times(status.frame_ms, max(self.size.width - 22, 10)))
+        self.tell(frame_times(status.frame_ms, max(self.size.width - 22, 10)))
 
 
 def frame_times(times: list[float], width: int) -> Text:
@@ -113,7 +171,7 @@ def frame_times(times: list[float], width: int) -> Text:
     return text
 
 
-class Streams(DataTable[Text]):
+class Streams(Rows):
     """One row a sensor: rate, losses, state; what is wrong is told below (``Advice``)."""
 
     DEFAULT_CSS = "Streams { overflow-x: hidden; }"
@@ -129,17 +187,19 @@ class Streams(DataTable[Text]):
 
     def show(self, status: Status) -> None:
         """Redraw for a status."""
-        self.clear()
-        for s in status.streams:
-            slow = s.expected_hz > 0.0 and s.hz < 0.8 * s.expected_hz
-            bad = s.state in ("failed", "silent")
-            style = "bold red" if bad else "yellow" if slow or s.lost else "green"
-            self.add_row(
-                Text(s.name),
-                Text(f"{short(s.hz)}/{short(s.expected_hz)}" if s.expected_hz else short(s.hz), style=style),
-                Text(short(s.lost), style="yellow" if s.lost else "dim"),
-                Text(s.state, style=style),
-            )
+        self.fill([(s.name, _stream_cells(s)) for s in status.streams])
+
+
+def _stream_cells(s: Stream) -> list[Text]:
+    slow = s.expected_hz > 0.0 and s.hz < 0.8 * s.expected_hz
+    bad = s.state in ("failed", "silent")
+    style = "bold red" if bad else "yellow" if slow or s.lost else "green"
+    return [
+        Text(s.name),
+        Text(f"{short(s.hz)}/{short(s.expected_hz)}" if s.expected_hz else short(s.hz), style=style),
+        Text(short(s.lost), style="yellow" if s.lost else "dim"),
+        Text(s.state, style=style),
+    ]
 
 
 def short(number: float) -> str:
@@ -150,7 +210,7 @@ def short(number: float) -> str:
     raise AssertionError("the last unit takes everything")
 
 
-class Queries(DataTable[Text]):
+class Queries(Rows):
     """The live questions: colour, count, best score; Enter goes to the next of its objects."""
 
     DEFAULT_CSS = "Queries { overflow-x: hidden; }"
@@ -175,33 +235,33 @@ class Queries(DataTable[Text]):
     def show(self, queries: list[QueryStatus]) -> None:
         """Redraw, the cursor stays where it is."""
         row = self.cursor_row
-        self.clear()
-        for q in queries:
-            found = q.count > 0
-            self.add_row(
-                Text("██", style=f"rgb({q.colour[0]},{q.colour[1]},{q.colour[2]})"),
-                Text(f" {q.text}"),
-                Text(str(q.count), style="bold" if found else "dim"),
-                Text(f"{q.score:.2f}" if q.score > 0.0 else "-"),
-                Text(
-                    f"{q.status}: {q.note}" if q.note and self.size.width > _WIDE else q.status,
-                    style="green" if found else "dim",
-                ),
-                key=q.text,
-            )
-        if queries:
-            self.move_cursor(row=min(row, len(queries) - 1))
+        self.fill([(q.text, self._cells(q)) for q in queries])
+        if queries and self.cursor_row != (kept := min(row, len(queries) - 1)):
+            self.move_cursor(row=kept)
+
+    def _cells(self, q: QueryStatus) -> list[Text]:
+        found = q.count > 0
+        return [
+            Text("██", style=f"rgb({q.colour[0]},{q.colour[1]},{q.colour[2]})"),
+            Text(f" {q.text}"),
+            Text(str(q.count), style="bold" if found else "dim"),
+            Text(f"{q.score:.2f}" if q.score > 0.0 else "-"),
+            Text(
+                f"{q.status}: {q.note}" if q.note and self.size.width > _WIDE else q.status,
+                style="green" if found else "dim",
+            ),
+        ]
 
 
-class Gauges(Static):
+class Gauges(Sentence):
     """State, time, map, disk and battery in two lines."""
 
     def show(self, status: Status) -> None:
         """Redraw for a status."""
-        self.update(gauges(status))
+        self.tell(gauges(status))
 
 
-def gauges(status: Status) -> RenderResult:
+def gauges(status: Status) -> Text:
     """Two lines that fit 78 columns."""
     styles = {"recording": "bold white on red", "fault": "bold white on red", "saving": "black on yellow"}
     text = Text()
@@ -243,12 +303,14 @@ def _left(name: str, minutes: float | None) -> Text:
     return Text(f"{name} {minutes:.0f} min  ", style=style)
 
 
-class Advice(Static):
+class Advice(Sentence):
     """What the operator should know or do now, the gravest first."""
+
+    fixed_size = False
 
     def show(self, status: Status) -> None:
         """Redraw for a status."""
-        self.update(advice(status))
+        self.tell(advice(status))
 
 
 def advice(status: Status) -> Text:

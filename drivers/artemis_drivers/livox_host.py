@@ -19,10 +19,16 @@ from artemis_drivers.base import Applied, DriverError, Health, State
 from artemis_drivers.livox_dialogue import Datagram
 from artemis_drivers.livox_slots import CLOCK_NAMES, IMU_SLOT, POINT_SLOT
 from artemis_drivers.ring import Ring, RingMaker
-from artemis_drivers.udp import PACKET, RECEIVE_BUFFER, PacketReceiver, open_udp, receive_buffer_warning
+from artemis_drivers.udp import (
+    MOST_AT_A_TIME,
+    PACKET,
+    RECEIVE_BUFFER,
+    PacketReceiver,
+    open_udp,
+    receive_buffer_warning,
+)
 
-POLL_S = 0.01  # 25 packets of an Avia; the kernel has stamped them on arrival
-_BATCH = 256
+POLL_S = 0.02  # 50 packets of an Avia; the kernel has stamped them on arrival
 _STOP_S = 1.5
 _UTC_FIRST, _UTC_END = 946_684_800 * 10**9, 9_025_257_600 * 10**9  # years 2000 to 2255, ns since 1970
 PACKET_SLOTS = 8192  # 3.3 s of single returns, 1 s of triple returns
@@ -122,12 +128,12 @@ class LivoxLidar:
         arrived = 0
         for receiver in self._receivers:
             receiver.sender = self.session.device_ip or None
-            for _ in range(PACKET_SLOTS // _BATCH):  # a flood must not keep the session from speaking
+            for _ in range(PACKET_SLOTS // MOST_AT_A_TIME):  # a flood must not keep the session from speaking
                 first = self.packets.published
-                count = receiver.drain(_BATCH)
+                count = receiver.drain(MOST_AT_A_TIME)
                 self.decoder.decode(first, count)
                 arrived += count
-                if count < _BATCH:
+                if count < MOST_AT_A_TIME:
                     break
         if arrived:
             self._last_data = now
@@ -177,7 +183,7 @@ class LivoxHost:
         self.lidars = tuple(lidars)
         self._finders = tuple(finders)
         self._sockets: list[socket.socket] = []
-        self._wake = threading.Event()
+        self._ending = False
         self._thread: threading.Thread | None = None
         self._fault: BaseException | None = None
         self._finder_counters: Counter[str] = Counter()
@@ -197,14 +203,14 @@ class LivoxHost:
         now = time.monotonic_ns()
         for lidar in self.lidars:
             lidar.session.start(now)
-        self._wake.clear()
+        self._ending = False
         self._thread = threading.Thread(target=self._run, name="livox", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """Stop sampling, take leave of the devices, close."""
         if self._thread is not None:
-            self._wake.set()
+            self._ending = True
             self._thread.join()
             self._thread = None
         self._close()
@@ -217,8 +223,9 @@ class LivoxHost:
 
     def _run(self) -> None:
         try:
-            while not self._wake.wait(POLL_S):
+            while not self._ending:
                 self._step()
+                time.sleep(POLL_S)
             for lidar in self.lidars:
                 lidar.session.begin_stop(time.monotonic_ns())
             end = time.monotonic() + _STOP_S

@@ -6,7 +6,8 @@ next packet is due when the last point of this one is (the official driver calls
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,53 +179,39 @@ def days_of(year: int, month: int, day: int) -> int:
     return 10957 + 365 * y + leaps_before + before + day - 1
 
 
-class Cloud(NamedTuple):
-    """Points of a time window in the order of arrival: ``xyz`` float32 (n, 3) metres, ``offset_s`` float32 (n,)
-    from the window's start, ``reflectivity``, ``tag``, ``line`` uint8 (n,); ``no_return`` shots found nothing."""
-
-    xyz: NDArray[np.float32]
-    offset_s: NDArray[np.float32]
-    reflectivity: NDArray[np.uint8]
-    tag: NDArray[np.uint8]
-    line: NDArray[np.uint8]
-    no_return: int
+Slots = dict[str, NDArray[Any]]
+"""Slots read of a point ring: an array for each field."""
 
 
-def collect(slots: dict[str, NDArray[np.generic]], start_ns: int, end_ns: int) -> Cloud:
-    """Points measured in ``start_ns <= t < end_ns`` of device time, from slots read of a point ring."""
-    arrays = PointArrays(*(slots[name] for name in PointArrays._fields))  # type: ignore[arg-type]
-    n = int(arrays.filled.astype(np.int64).sum())
-    xyz, offset = np.empty((n, 3), np.float32), np.empty(n, np.float32)
-    reflectivity, tag, line = np.empty(n, np.uint8), np.empty(n, np.uint8), np.empty(n, np.uint8)
-    kept, empty = _collect(arrays, start_ns, end_ns, xyz, offset, reflectivity, tag, line)
-    return Cloud(xyz[:kept], offset[:kept], reflectivity[:kept], tag[:kept], line[:kept], empty)
+def collect(
+    batches: Sequence[tuple[Slots, int]], start_ns: int, end_ns: int, point: np.dtype[np.void]
+) -> NDArray[np.void]:
+    """Points measured in ``start_ns <= t < end_ns``, in the order of arrival; shots that found nothing are left out.
+
+    ``batches`` are slots and what is added to their device time. ``point`` is the type of a row, with fields x, y, z
+    (m), intensity (reflectivity, 0..1), tag, line and t (ns from the start).
+    """
+    cloud, count = np.empty(sum(int(slots["filled"].sum()) for slots, _ in batches), point), 0
+    for slots, offset_ns in batches:
+        arrays = PointArrays(*(slots[name] for name in PointArrays._fields))
+        count = _collect(arrays, offset_ns - start_ns, end_ns - start_ns, cloud, count)
+    return cloud[:count]
 
 
 @njit
-def _collect(
-    p: PointArrays,
-    start: int,
-    end: int,
-    xyz: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    reflectivity: NDArray[np.uint8],
-    tag: NDArray[np.uint8],
-    line: NDArray[np.uint8],
-) -> tuple[int, int]:
-    n = empty = 0
+def _collect(p: PointArrays, shift: int, span: int, cloud: NDArray[np.void], n: int) -> int:
+    """Points at 0 <= device time + ``shift`` < ``span`` into rows from ``n`` on; the row after the last."""
     for k in range(p.stamp_ns.size):
+        first = p.stamp_ns[k] + shift
         for i in range(p.filled[k]):
             shot = i // p.returns[k]
-            t = p.stamp_ns[k] - start + shot * float(p.shot_ns[k])
-            if t < 0 or t >= end - start:
-                continue
+            t = first + shot * float(p.shot_ns[k])
             x, y, z = p.xyz[k, i, 0], p.xyz[k, i, 1], p.xyz[k, i, 2]
-            if x == 0 and y == 0 and z == 0:
-                empty += 1
+            if t < 0 or t >= span or (x == 0 and y == 0 and z == 0):
                 continue
-            xyz[n, 0], xyz[n, 1], xyz[n, 2] = x, y, z
-            offset[n] = t * 1e-9
-            reflectivity[n], tag[n] = p.reflectivity[k, i], p.tag[k, i]
-            line[n] = shot % p.lines[k]
+            row = cloud[n]
+            row.x, row.y, row.z = x, y, z
+            row.intensity = np.float32(p.reflectivity[k, i]) / np.float32(255)
+            row.tag, row.line, row.t = p.tag[k, i], shot % p.lines[k], round(t)
             n += 1
-    return n, empty
+    return n

@@ -8,7 +8,7 @@ directly. Slots are numbered from 0 without end; slot ``n`` lives in row ``n % s
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,18 @@ class Ring:
         for name, value in values.items():
             self.field[name][row] = value
         self.publish(1)
+
+    def extend(self, rows: Sequence[Sequence[object]]) -> None:
+        """Write and publish slots, each with its values in the order of the fields."""
+        for begin in range(0, len(rows), self.slots):
+            part = rows[begin : begin + self.slots]
+            start = self.claim(len(part)) % self.slots
+            head = min(len(part), self.slots - start)  # what is left goes to the first rows
+            for array, column in zip(self.field.values(), zip(*part, strict=True), strict=True):
+                array[start : start + head] = column[:head]
+                if head < len(part):
+                    array[: len(part) - head] = column[head:]
+            self.publish(len(part))
 
     def oldest(self) -> int:
         """Number of the oldest slot that is certainly intact."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 import errno
 import fcntl
 import ipaddress
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from artemis_drivers.base import DriverError
+from artemis_drivers.datagrams import SO_RXQ_OVFL, SO_TIMESTAMPNS, Datagrams
 from artemis_drivers.ring import Ring
 
 PACKET_BYTES = 1500  # one Ethernet frame; Livox packets have at most 1362 bytes
@@ -23,13 +23,10 @@ PACKET = np.dtype([("rx_ns", "i8"), ("size", "i4"), ("data", "u1", (PACKET_BYTES
 """A datagram as received: ``rx_ns`` is the kernel's stamp, moved to the host's monotonic clock."""
 
 RECEIVE_BUFFER = 8 << 20  # bytes: 1.5 s of 2500 packets/s, so that a pause of the interpreter costs nothing
-_SO_RXQ_OVFL = 40
-_SO_TIMESTAMPNS = 35
 _SIOCGIFADDR, _SIOCGIFNETMASK = 0x8915, 0x891B
-_ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4)
-_STAMP = struct.Struct("qq")
-_TRUNCATED = int(socket.MSG_TRUNC)  # an enum's own bits are found ten times as slowly
 _MAX_AGE_NS = 10_000_000_000  # an older kernel stamp means that the host's clock was set meanwhile
+_AHEAD_NS = 1_000_000  # the two clocks are read one after the other
+MOST_AT_A_TIME = 256
 
 
 class Interface(NamedTuple):
@@ -90,8 +87,8 @@ def open_udp(port: int, address: str = "", *, receive_buffer: int = 0) -> socket
     try:
         if receive_buffer:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
-            sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
-            sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+            sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         sock.bind((address, port))
     except OSError as fault:
         sock.close()
@@ -134,62 +131,50 @@ class PacketReceiver:
         self.truncated = 0
         self.foreign = 0
         self.clock_set = 0
-        self._rows = [memoryview(row) for row in ring.field["data"]]
-        self._real_minus_monotonic = 0
+        self._datagrams = Datagrams(ring.field["data"], min(MOST_AT_A_TIME, ring.slots))
 
     def drain(self, limit: int) -> int:
-        """Receive up to ``limit`` waiting datagrams; returns how many slots were published."""
-        ring, size, rx = self.ring, self.ring.field["size"], self.ring.field["rx_ns"]
-        limit = min(limit, ring.slots)
+        """Receive up to ``limit`` (MOST_AT_A_TIME) waiting datagrams; returns how many slots were published."""
+        ring, got = self.ring, self._datagrams
+        limit = min(limit, ring.slots, MOST_AT_A_TIME)
         first = ring.claim(limit)
-        began = time.monotonic_ns()
-        self._real_minus_monotonic = time.time_ns() - began
-        count = 0
-        for _ in range(limit):
-            row = (first + count) % ring.slots
-            try:
-                n, ancillary, flags, source = self.sock.recvmsg_into([self._rows[row]], _ANCILLARY)
-            except BlockingIOError:
-                break
-            except ConnectionRefusedError:  # an earlier answer of ours met a closed port
-                continue
-            rx[row] = self._stamp(ancillary, began)
-            if flags & _TRUNCATED:
-                self.truncated += 1
-            elif self.sender is not None and source[0] != self.sender:
-                self.foreign += 1
-            else:
-                size[row] = n
-                count += 1
-        ring.publish(count, touched=count + 1)  # a datagram not taken lies in the next slot
-        return count
+        count = got.receive(self.sock, first % ring.slots, limit)
+        if count == 0:
+            ring.publish(0)
+            return 0
+        rows = (first + np.arange(count)) % ring.slots
+        ring.field["rx_ns"][rows] = self._monotonic(got.stamps_ns(count))
+        ring.field["size"][rows] = got.sizes(count)
+        self.kernel_drops = got.drops(count) or self.kernel_drops
+        wanted = self._wanted(count)
+        kept = int(np.count_nonzero(wanted))
+        if kept < count:
+            for field in ring.field.values():
+                field[rows[:kept]] = field[rows[wanted]]
+        ring.publish(kept, touched=count)
+        return kept
 
-    def _stamp(self, ancillary: list[tuple[int, int, bytes]], began: int) -> int:
-        """When a datagram arrived; most of them before the draining ``began``."""
-        stamp = 0
-        for _, kind, data in ancillary:
-            if kind == _SO_TIMESTAMPNS:
-                seconds, nanoseconds = _STAMP.unpack(data)
-                stamp = seconds * 1_000_000_000 + nanoseconds - self._real_minus_monotonic
-            elif kind == _SO_RXQ_OVFL:
-                self.kernel_drops = array.array("I", data)[0]
-        if began - _MAX_AGE_NS < stamp <= began:
-            return stamp
+    def _wanted(self, count: int) -> NDArray[np.bool_]:
+        """Which datagrams are whole and from the device."""
+        truncated = self._datagrams.truncated(count)
+        self.truncated += int(np.count_nonzero(truncated))
+        if self.sender is None:
+            return ~truncated
+        own = np.frombuffer(socket.inet_aton(self.sender), np.uint8)
+        foreign = (self._datagrams.senders(count) != own).any(axis=1) & ~truncated
+        self.foreign += int(np.count_nonzero(foreign))
+        wanted: NDArray[np.bool_] = ~(truncated | foreign)
+        return wanted
+
+    def _monotonic(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """When datagrams arrived by the monotonic clock; now, where the kernel's stamp cannot be."""
         now = time.monotonic_ns()
-        if now - _MAX_AGE_NS < stamp <= now + 1_000_000:
-            return min(stamp, now)
-        self.clock_set += 1
-        return now
+        arrived = stamps_ns - (time.time_ns() - now)
+        known = (now - _MAX_AGE_NS < arrived) & (arrived <= now + _AHEAD_NS)
+        self.clock_set += int(np.count_nonzero(~known))
+        return np.where(known, np.minimum(arrived, now), now)
 
 
 def packet_bytes(packets: dict[str, NDArray[np.generic]]) -> list[bytes]:
     """The datagrams of slots read from a packet ring, as bytes."""
     return [row[:n].tobytes() for row, n in zip(packets["data"], packets["size"].tolist(), strict=True)]
-
-
-def joined_bytes(packets: dict[str, NDArray[np.generic]]) -> bytes:
-    """All of them, one after the other; in one copy where they are of one size, as a LiDAR's are."""
-    size = packets["size"]
-    if len(size) and bool((size == size[0]).all()):
-        return packets["data"][:, : int(size[0])].tobytes()
-    return b"".join(packet_bytes(packets))

@@ -27,6 +27,8 @@ from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.udp import PACKET
 from artemis_drivers.virtual.wire_avia import VirtualAvia
 
+from artemis_edge.session.writer import POINT
+
 _TYPE = {"strongest": 2, "dual": 4, "triple": 7}
 _BURST_S = 0.002
 
@@ -58,9 +60,10 @@ def decode_ms(data_type: int) -> tuple[float, float]:
         decoder.decode(first, count)
         decoding.append(time.process_time() - began)
         began = time.process_time()
-        cloud = collect(reader.read()[1], frame * 100_000_000, (frame + 1) * 100_000_000)
+        slots = reader.read()[1]
+        cloud = collect([(slots, 0)], frame * 100_000_000, (frame + 1) * 100_000_000, POINT)
         collecting.append(time.process_time() - began)
-        assert len(cloud.xyz) >= 24_000
+        assert len(cloud) >= 24_000
     return statistics.median(decoding[3:]) * 1e3, statistics.median(collecting[3:]) * 1e3
 
 

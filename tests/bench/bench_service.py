@@ -24,7 +24,6 @@ import numpy as np
 from tests.control_client import ask
 from tests.livox_ports import reserved
 
-_TICKS = os.sysconf("SC_CLK_TCK")
 _PLAYER = """
 import sys, time
 from pathlib import Path
@@ -37,17 +36,6 @@ with WireRig(read(Path(sys.argv[1])), Path(sys.argv[2])) as rig:
             rig.over.wait()
             print("over", flush=True)
 """
-
-
-def cpu_by_thread(pid: int) -> dict[str, float]:
-    """Seconds of CPU of each thread so far, by name and number."""
-    found = {}
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        text = (task / "stat").read_text()
-        name = text[text.index("(") + 1 : text.rindex(")")]
-        user, system = text[text.rindex(")") + 2 :].split()[11:13]
-        found[f"{name} {task.name}"] = (int(user) + int(system)) / _TICKS
-    return found
 
 
 def mapped(state: dict[str, Any]) -> dict[str, Any]:
@@ -74,7 +62,7 @@ def measure(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
         if not given.still:
             player.stdin.write("begin\n")
             player.stdin.flush()
-        return watch(given.seconds, control, service.pid)
+        return watch(given.seconds, control)
     finally:
         service.send_signal(signal.SIGINT)
         time.sleep(2.0)
@@ -84,9 +72,9 @@ def measure(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
         player.wait()
 
 
-def watch(seconds: float, control: Path, pid: int) -> dict[str, Any]:
+def watch(seconds: float, control: Path) -> dict[str, Any]:
     """Counts and times between two looks."""
-    first, before, start = ask(control, do="state")["result"], cpu_by_thread(pid), time.monotonic()
+    first, start = ask(control, do="state")["result"], time.monotonic()
     times: dict[int, float] = {}
     cpus: dict[int, float] = {}
     state = first
@@ -99,10 +87,10 @@ def watch(seconds: float, control: Path, pid: int) -> dict[str, Any]:
             times[mapping["mapped"] - len(latest) + k] = ms
             cpus[mapping["mapped"] - len(latest) + k] = cpu_ms
     wall = time.monotonic() - start
-    after = cpu_by_thread(pid)
     since = mapped(first).get("mapped", 0)
     new = [ms for frame, ms in times.items() if frame >= since]
     new_cpu = [ms for frame, ms in cpus.items() if frame >= since]
+    before, after = first["threads_cpu_s"], state["threads_cpu_s"]
     share = {name: round((s - before.get(name, 0.0)) / wall * 100, 2) for name, s in after.items()}
     cpu: dict[str, float] = defaultdict(float)
     for name in ("recorder", "mapping", "segmentation"):
@@ -111,7 +99,8 @@ def watch(seconds: float, control: Path, pid: int) -> dict[str, Any]:
     return {
         "seconds": round(wall, 1),
         "load": os.getloadavg()[0],
-        "service_percent": round(sum(share.values()), 1),
+        "service_percent": round((state["cpu_s"] - first["cpu_s"]) / wall * 100, 1),
+        "receiving_percent": round(sum(s for name, s in share.items() if name != "MainThread"), 1),
         "threads_percent": dict(sorted(share.items(), key=lambda item: -item[1])),
         "others_percent": dict(cpu),
         "frames": len(new),

@@ -25,8 +25,8 @@ class Port(Protocol):
 
     baudrate: int
 
-    def chunk(self) -> bytes:
-        """What has arrived, waiting up to READ_TIMEOUT_S for the first byte; OSError if the device is gone."""
+    def chunk(self, timeout_s: float = READ_TIMEOUT_S) -> bytes:
+        """What has arrived, waiting up to ``timeout_s`` for the first byte; OSError if the device is gone."""
         ...
 
     def write(self, data: bytes) -> None:
@@ -63,10 +63,10 @@ class SerialPort:
         except termios.error as fault:
             raise OSError(*fault.args) from fault
 
-    def chunk(self) -> bytes:
+    def chunk(self, timeout_s: float = READ_TIMEOUT_S) -> bytes:
         """See Port. Read directly: pyserial asks the system five times for what takes two."""
         descriptor = self._port.fileno()
-        ready, _, _ = select.select([descriptor], [], [], READ_TIMEOUT_S)
+        ready, _, _ = select.select([descriptor], [], [], timeout_s)
         if not ready:
             return b""
         data = os.read(descriptor, _CHUNK)

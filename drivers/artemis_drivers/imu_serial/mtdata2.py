@@ -231,6 +231,27 @@ def decode_items(data: bytes) -> tuple[Item, ...]:
     return tuple(items)
 
 
+def item_layouts(data: bytes) -> list[tuple[bytes, struct.Struct]] | None:
+    """Header and layout of each item of an MTData2 message that ``decode_items`` accepts, an unknown one as bytes.
+
+    None where an item holds fixed-point numbers, which ``struct`` cannot read.
+    """
+    found, at = [], 0
+    while at < len(data):
+        head = data[at : at + 3]
+        layout = _layout(head[0] << 8 | head[1])
+        if layout is None and type_of(head) in _REALS:
+            return None
+        found.append((head, layout or struct.Struct(f">{head[2]}s")))
+        at += 3 + head[2]
+    return found
+
+
+def type_of(head: bytes) -> int:
+    """What an item with this header is: compare with Type."""
+    return (head[0] << 8 | head[1]) & _TYPE_BITS
+
+
 def encode_items(items: Sequence[Item]) -> bytes:
     """The data of an MTData2 message; ValueError or struct.error if a value does not fit its format."""
     parts = []

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -70,7 +72,7 @@ def protocol(settings: ImuSettings) -> Protocol:
     if isinstance(settings, MtiSettings):
         mti: MtiSettings = settings
         clock = DeviceClock(XSENS_CLOCK, mti.rate_hz)
-        return Protocol(mtdata2.XbusFraming(), clock, lambda port: configure_mti(port, mti), mti_sample)
+        return Protocol(mtdata2.XbusFraming(), clock, lambda port: configure_mti(port, mti), MtiReader())
     vn: VectorNavSettings = settings
     clock = DeviceClock(VECTORNAV_CLOCK, vn.rate_hz)
     configure = lambda port: configure_vectornav(port, vn)  # noqa: E731
@@ -95,6 +97,76 @@ def mti_sample(frame: bytes) -> Sample | None:
         raise MalformedError("a sample without counter or time") from missing
     _require_finite(gyro, accel)
     return Sample(ticks, counter, gyro, accel, values.get(Type.STATUS_WORD, (0,))[0])
+
+
+class MtiReader:
+    """``mti_sample`` for a stream whose frames are laid out alike: then one ``struct`` reads the whole frame.
+
+    Frames as FrameSplitter hands them out, their check sum verified.
+    """
+
+    def __init__(self) -> None:
+        self._layout: _Layout | None = None
+
+    def __call__(self, frame: bytes) -> Sample | None:
+        """The sample in an Xbus frame; None and MalformedError as ``mti_sample``."""
+        if self._layout is not None and (sample := self._layout.read(frame)) is not None:
+            return sample
+        sample = mti_sample(frame)
+        if sample is not None:
+            self._layout = _layout_of(frame)
+        return sample
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """A frame is ``heads`` (everything that is not a value) at ``head_at`` of what ``whole`` unpacks; the values of a
+    sample begin at ``ticks``, ``counter``, ``gyro``, ``accel`` and ``status`` (None: not sent).
+    """
+
+    whole: struct.Struct
+    head_at: Callable[[tuple[Any, ...]], Any]
+    heads: Any
+    ticks: int
+    counter: int
+    gyro: int
+    accel: int
+    status: int | None
+
+    def read(self, frame: bytes) -> Sample | None:
+        """None for a frame that is laid out otherwise."""
+        if len(frame) != self.whole.size:
+            return None
+        v = self.whole.unpack(frame)
+        if self.head_at(v) != self.heads:
+            return None
+        gyro, accel = v[self.gyro : self.gyro + 3], v[self.accel : self.accel + 3]
+        _require_finite(gyro, accel)
+        return Sample(
+            v[self.ticks], v[self.counter], gyro, accel, 0 if self.status is None else v[self.status]
+        )
+
+
+def _layout_of(frame: bytes) -> _Layout | None:
+    """Of a frame that holds a sample; None where its numbers are of a kind that ``struct`` does not know."""
+    items = mtdata2.item_layouts(mtdata2.decode(frame).data)
+    if items is None:
+        return None
+    first = len(frame) - 1 - sum(len(head) + layout.size for head, layout in items)
+    codes, place, at, head_at = [f"{first}s"], dict[int, int](), 1, [0]
+    for head, layout in items:
+        head_at.append(at)
+        place[mtdata2.type_of(head)] = at + 1
+        codes += [f"{len(head)}s", layout.format[1:]]
+        at += 1 + len(layout.unpack(bytes(layout.size)))
+    gyro = place.get(Type.RATE_OF_TURN, place.get(Type.RATE_OF_TURN_HR))
+    accel = place.get(Type.ACCELERATION, place.get(Type.ACCELERATION_HR))
+    ticks, counter = place.get(Type.SAMPLE_TIME_FINE), place.get(Type.PACKET_COUNTER)
+    if gyro is None or accel is None or ticks is None or counter is None or len(place) < len(items):
+        return None
+    whole, heads = struct.Struct(">" + "".join(codes) + "x"), itemgetter(*head_at)
+    values = whole.unpack(frame)
+    return _Layout(whole, heads, heads(values), ticks, counter, gyro, accel, place.get(Type.STATUS_WORD))
 
 
 def vectornav_sample(frame: bytes) -> Sample | None:
