@@ -18,7 +18,7 @@ help:
 	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
 	@echo "make wire    a minute played on the wire by virtual devices: losses and CPU of the service (some minutes)"
 	@echo "make viewer-test  GLB and browser view in headless Chromium (fetches three.js with npm)"
-	@echo "make terminal-test  demo --tui in tmux at 80x24 and 160x48, from its start to its report (some minutes)"
+	@echo "make terminal-test  tui and demo --tui in tmux at 80x24 and 160x48, from start to report (some minutes)"
 	@echo "make cluster-test  four recordings on two Dask workers, one of which is killed (a minute or two)"
 	@echo "make train   render views of the virtual worlds, train and export the shipped network (an hour or two, torch)"
 	@echo "make install-service   as root: the systemd service and what belongs to it (docs/operator.md)"
@@ -42,7 +42,7 @@ demo: $(READY)
 	@$(BIN)/artemis-edge demo --out $(OUT)
 
 test: $(READY)
-	@$(BIN)/python -m pytest -n 2 --dist loadfile
+	@$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(READY)
 	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/mypy --no-error-summary
@@ -66,7 +66,7 @@ viewer-test: $(READY)
 
 terminal-test: $(READY)
 	@command -v tmux >/dev/null || { echo "tmux is needed: on Debian and Ubuntu: apt install tmux"; exit 2; }
-	@ARTEMIS_TERMINAL=1 $(BIN)/python -m pytest tests/soak/test_demo_terminal.py
+	@ARTEMIS_TERMINAL=1 $(BIN)/python -m pytest tests/test_tui_terminal.py tests/soak/test_demo_terminal.py
 
 cluster-test: $(READY)
 	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install -qq --only-binary :all: -e '.[dev,cluster]'

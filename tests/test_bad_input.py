@@ -200,7 +200,7 @@ def test_recording_to_a_disk_that_fills(tmp_path: Path) -> None:
         "-c",
         _LIMITED,
         "simulate",
-        "street",
+        "corridor",
         "--seconds",
         "0.3",
         "--set",

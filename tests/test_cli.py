@@ -230,7 +230,7 @@ def test_a_world_that_is_not_there_leaves_no_folder(
 
 def test_simulate_writes_a_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "walk"
-    arguments = ["simulate", "street", "--seconds", "0.3", "--out", str(out), "--set", "density=0.05"]
+    arguments = ["simulate", "corridor", "--seconds", "0.3", "--out", str(out), "--set", "density=0.05"]
     quick = ["--set", "camera=off", "--set", "reach_m=30", "--set", "reference=off"]
     assert main([*arguments, *quick]) == 0
     assert "3 frames" in capsys.readouterr().out

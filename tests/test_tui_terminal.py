@@ -1,10 +1,11 @@
-"""``artemis-edge tui`` in a real terminal (tmux) of two sizes, attached to a service that a test plays.
+"""``artemis-edge tui`` in a real terminal (tmux), attached to a service that a test plays; more sizes with ``make``.
 
-The demo from its start to its report, which takes minutes, is in tests/viewer/test_demo_terminal.py.
+The demo from its start to its report, which takes minutes, is in tests/soak/test_demo_terminal.py.
 """
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -80,7 +81,10 @@ def service(tmp_path: Path) -> Iterator[Played]:
     played.close()
 
 
-@pytest.mark.parametrize("size", [(80, 24), (160, 48)])
+_WIDER = pytest.mark.skipif("ARTEMIS_TERMINAL" not in os.environ, reason="asked for by make terminal-test")
+
+
+@pytest.mark.parametrize("size", [(80, 24), pytest.param((160, 48), marks=_WIDER)])
 def test_a_newcomer_asks_stops_and_finds_the_report(
     service: Played, tmp_path: Path, size: tuple[int, int]
 ) -> None:
