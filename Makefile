@@ -58,6 +58,8 @@ wire: $(READY)
 	@$(BIN)/python tests/soak/wire_minute.py
 	@$(BIN)/python tests/bench/bench_livox.py --seconds 30 --mode triple
 	@$(BIN)/python tests/soak/replug_devices.py
+	@$(BIN)/python tests/soak/kill_mapping.py
+	@$(BIN)/python tests/soak/kill_recorder.py
 
 viewer-test: $(READY)
 	@command -v npm >/dev/null || { echo "npm is needed: on Debian and Ubuntu: apt install npm chromium"; exit 2; }

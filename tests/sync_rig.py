@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from artemis_drivers.imu_serial.clock import XSENS_CLOCK, DeviceClock
+from artemis_drivers.imu_serial.driver import COLLECT_S
 from artemis_drivers.ring import Ring, RingReader
 from artemis_drivers.trigger.board import TriggerBoard
 from artemis_drivers.trigger.events import TRIGGER_EVENT
@@ -111,6 +112,16 @@ class Rig:
         """Host times; a stream keeps its order."""
         jitter = JITTERS[self.spec.jitter](self.rng, len(truth_s), self.spec.jitter_ns)
         return np.maximum.accumulate(self.host_ns(truth_s + (latency_ns + jitter) * 1e-9))
+
+    def collected(self, arrivals: np.ndarray) -> np.ndarray:
+        """As the IMU's driver takes samples in: one that it waits for, then all that came in a pause."""
+        taken, k = arrivals.copy(), 0
+        while k < len(taken):
+            end = taken[k] + round(COLLECT_S * 1e9)
+            after = int(np.searchsorted(arrivals, end, "right"))
+            taken[k + 1 : after] = end
+            k = max(after, k + 1)
+        return taken
 
     def kept(self, count: int, share_lost: float) -> np.ndarray:
         return self.rng.uniform(size=count) >= share_lost
@@ -230,7 +241,8 @@ class Run:
         count = int((rig.stop_s - 0.5) * spec.imu_hz)
         device_s = np.arange(count) / spec.imu_hz
         truth_s = 0.3 + device_s / (1 + rig.imu)
-        arrivals, sessions = rig.arrivals(truth_s, IMU_LATENCY_NS), rig.session_ns(truth_s)
+        arrivals = rig.collected(rig.arrivals(truth_s, IMU_LATENCY_NS))
+        sessions = rig.session_ns(truth_s)
         for k in range(count):
             ticks = (spec.first_tick + int(k * 10_000 / spec.imu_hz)) % 2**32
             number = (spec.first_sample + k) % 2**16

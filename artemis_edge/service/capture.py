@@ -35,7 +35,7 @@ from artemis_edge.session.writer import structured_cloud
 from artemis_edge.session_clocks import epoch_of
 from artemis_edge.sync import BoardEvent, ImageTime, Synchroniser
 
-_TURN_S = 0.025  # devices date what they hear themselves; a turn costs as much for one sample as for ten
+_TURN_S = 0.03  # devices date what they hear themselves; a turn costs as much for one sample as for ten
 _SECOND_NS = 1_000_000_000
 _RAW_EVERY_NS = 100_000_000
 _IMAGE_PATIENCE_NS = 150_000_000  # after the end of a window

@@ -4,7 +4,7 @@
 
 CPU time is that of the driver's process (all threads, user and system) while the data flow. Packets are made
 before they are sent, so that the sender keeps up; it sends in bursts every 2 ms, harder on the receiver than the
-even spacing of a device.
+even spacing of a device. Exit code 1 if a packet was lost.
 """
 
 import argparse
@@ -123,8 +123,9 @@ def main() -> int:
     opts = args.parse_args()
     decoding, collecting = decode_ms(_TYPE[opts.mode])
     report = {"mode": opts.mode, "decode_ms": round(decoding, 3), "collect_ms": round(collecting, 3)}
-    print(json.dumps(report | receive(opts.mode, opts.seconds), indent=1))
-    return 0
+    received = receive(opts.mode, opts.seconds)
+    print(json.dumps(report | received, indent=1))
+    return 1 if received["points_packets"] != received["sent"] or received["kernel_drops"] else 0
 
 
 if __name__ == "__main__":

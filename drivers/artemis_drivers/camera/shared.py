@@ -13,7 +13,7 @@ from artemis_drivers.camera.frames import FRAME_SLOTS, CameraFrame, frame_dtype,
 from artemis_drivers.camera.settings import SharedSettings
 from artemis_drivers.ring import Ring, RingReader
 
-_POLL_S = 0.005
+_POLL_S = 0.01
 
 
 def _mapped(descriptor: int, most_bytes: int) -> Ring:

@@ -21,7 +21,7 @@ IMU_CHUNK = np.dtype([("rx_ns", "i8"), ("size", "i4"), ("data", "u1", (CHUNK_BYT
 """Bytes as they arrived: ``rx_ns`` is host monotonic time."""
 
 _MOST_LOST = int(np.iinfo(np.int32).max)
-_COLLECT_S = 0.02  # 4 kB of a line of 2 Mbaud: what the kernel holds at least
+COLLECT_S = 0.01  # 2 kB of a line of 2 Mbaud; longer, and the least delay is met too seldom (tests/soak/sync_study.py)
 SILENT_S = 0.5  # a running IMU sends hundreds of samples a second
 
 
@@ -90,7 +90,7 @@ class SerialImu(DeviceThread):
                 # A sample that was waited for has told how early it can be here. Some more may collect before the next
                 # one is waited for: a thread that wakes at each of 400 a second costs three times as much.
                 if taken:
-                    time.sleep(_COLLECT_S)
+                    time.sleep(COLLECT_S)
                     self._take_waiting(port, 0.0)
             except OSError:
                 self._counts["unplugged"] += 1
