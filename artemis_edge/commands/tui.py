@@ -40,10 +40,12 @@ def run_attach(given: argparse.Namespace) -> int:
 def run_app(remote: Remote, sessions: Path) -> None:
     """Show ``remote`` until the operator leaves."""
     from artemis_edge.tui.app import ArtemisTui
+    from artemis_edge.tui.graphics import find_graphics
     from artemis_edge.tui.history import History, history_file
 
     try:
-        ArtemisTui(remote, sessions, _has_colour(), read_keys(keys_file()), History(history_file())).run()
+        colour, keys, history = _has_colour(), read_keys(keys_file()), History(history_file())
+        ArtemisTui(remote, sessions, colour, keys, history, find_graphics() if colour else None).run()
     finally:
         remote.close()
 

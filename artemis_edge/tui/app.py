@@ -22,6 +22,7 @@ from textual.suggester import SuggestFromList
 from textual.widgets import DataTable, Footer, Header, Input, Static
 
 from artemis_edge.status import Status
+from artemis_edge.tui.graphics import Graphics, PixelPicture
 from artemis_edge.tui.history import History
 from artemis_edge.tui.pages import ChecksPage, HelpPage, ReportPlace, SessionsPage
 from artemis_edge.tui.picture import Finder, Kind, MapCopy, draw
@@ -70,9 +71,11 @@ class LivePage(Screen[None]):
     view: reactive[Kind] = reactive("behind")
     span_m: reactive[float] = reactive(40.0)
 
-    def __init__(self, copy: MapCopy, colour: bool, history: History) -> None:
+    def __init__(
+        self, copy: MapCopy, colour: bool, history: History, graphics: Graphics | None = None
+    ) -> None:
         super().__init__()
-        self._copy, self._colour, self._history = copy, colour, history
+        self._copy, self._colour, self._history, self._graphics = copy, colour, history, graphics
         self._find = Finder(copy)
         self._status = Status()
         self._drawn: object = None  # what the picture was drawn of
@@ -84,7 +87,10 @@ class LivePage(Screen[None]):
         yield Gauges()
         with Horizontal():
             with Vertical(id="left"):
-                yield MeshPicture(self._colour, id="picture")
+                if self._graphics is None:
+                    yield MeshPicture(self._colour, id="picture")
+                else:
+                    yield PixelPicture(self._graphics, id="picture")
                 yield FrameTimes()
             with Vertical(id="right"):
                 yield Streams(id="streams")
@@ -134,7 +140,10 @@ class LivePage(Screen[None]):
         if known == self._drawn:
             return
         self._drawn = known
-        picture.show(draw(self._copy, width, height, at, status.yaw, self.view, self.span_m, queries))
+        spacing_m = picture.spacing_m
+        picture.show(
+            draw(self._copy, width, height, at, status.yaw, self.view, self.span_m, queries, spacing_m)
+        )
 
     def action_view(self) -> None:
         """Behind, above, behind ..."""
@@ -219,9 +228,10 @@ class ArtemisTui(App[None]):
 
     def __init__(
         self, remote: Remote, sessions: Path, colour: bool = True, keymap: dict[str, str] | None = None,
-        history: History | None = None,
+        history: History | None = None, graphics: Graphics | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
+        self._graphics = graphics
         self._remote = remote
         self._sessions = sessions
         self._copy = MapCopy()
@@ -240,7 +250,7 @@ class ArtemisTui(App[None]):
 
     def on_mount(self) -> None:
         """Pages, and the first look at the other side."""
-        self.install_screen(LivePage(self._copy, self._colour, self._history), "live")
+        self.install_screen(LivePage(self._copy, self._colour, self._history, self._graphics), "live")
         self.install_screen(ChecksPage(), "checks")
         self.install_screen(SessionsPage(self._sessions), "sessions")
         self.install_screen(HelpPage(), "help")

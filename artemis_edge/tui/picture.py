@@ -29,6 +29,8 @@ _PIECE_M = 0.5  # vertices of a class this near to each other are one thing
 _LEAST_PIECE = 20  # fewer are a stray mask
 _AGAIN_S = 1.0
 _HALF_RANGE = 1 << 19  # cells: 262 km
+_LARGEST = 6  # pixels of a vertex that is near
+_OVERLAP = 1.5  # of a vertex over its spacing, which is uneven
 _FOV = 1.1  # focal length over half the width: 85 degrees across
 
 
@@ -174,24 +176,41 @@ def draw(
     kind: Kind = "behind",
     span_m: float = 40.0,
     queries: Sequence[QueryStatus] = (),
+    spacing_m: float = 0.0,
 ) -> U8:
     """Picture uint8 (height, width, 3). What ``queries`` mean lights up; ``span_m`` is shown across.
 
-    Pixels are square. From above north (y) is up; the operator is drawn as a bright cross.
+    Pixels are square. From above north (y) is up; the operator is drawn as a bright cross. A vertex fills a pixel, or
+    where that is finer a square of ``spacing_m``.
     """
     points, shade, label = copy.points()
     image = np.full((height, width, 3), SKY, np.uint8)
     view = _above if kind == "above" else _behind
     u, v, depth = view(points, width, height, np.array(position), yaw, span_m)
-    seen = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (depth > 0.3)
+    rim = _LARGEST if spacing_m > 0.0 else 0
+    seen = (u >= -rim) & (u < width + rim) & (v >= -rim) & (v < height + rim) & (depth > 0.3)
     shade = highlight(shade, points, label, queries)
     rows = np.flatnonzero(seen)
     order = rows[np.argsort(-depth[rows], kind="stable")]  # the nearest is drawn last
-    flat = v[order].astype(np.int64) * width + u[order].astype(np.int64)
-    image.reshape(-1, 3)[flat] = _fogged(shade[order], depth[order], span_m, kind)
+    colour, u, v = _fogged(shade[order], depth[order], span_m, kind), u[order], v[order]
+    pixels_a_metre = width / span_m if kind == "above" else 0.5 * width * _FOV / depth[order]
+    size = np.broadcast_to(np.clip(np.ceil(_OVERLAP * spacing_m * pixels_a_metre), 1, _LARGEST), u.shape)
+    for side in np.unique(size).astype(int).tolist():  # what is larger is nearer
+        some = size == side
+        _stamp(image, u[some], v[some], side, colour[some])
     if kind == "above":
         _mark(image, width // 2, height // 2)
     return image
+
+
+def _stamp(image: U8, u: F64, v: F64, side: int, colour: U8) -> None:
+    """Squares of ``side`` pixels around (u, v), the last on top."""
+    height, width = image.shape[:2]
+    around = np.arange(side) - (side - 1) // 2
+    at_u, at_v = np.broadcast_arrays(u[:, None, None] + around, v[:, None, None] + around[:, None])
+    inside = (at_u >= 0) & (at_u < width) & (at_v >= 0) & (at_v < height)
+    flat = (at_v[inside] * width + at_u[inside]).astype(np.int64)
+    image.reshape(-1, 3)[flat] = np.broadcast_to(colour[:, None, None], (*inside.shape, 3))[inside]
 
 
 def highlight(shade: U8, points: F32, label: U8, queries: Sequence[QueryStatus]) -> U8:

@@ -34,6 +34,7 @@ class MeshPicture(Widget):
     """A picture in half blocks: every character is two pixels, one above the other."""
 
     DEFAULT_CSS = "MeshPicture { height: 1fr; min-height: 6; background: #0c0e14; }"
+    spacing_m = 0.0  # of vertices, where a pixel is finer than that
 
     def __init__(self, colour: bool = True, id: str | None = None) -> None:
         super().__init__(id=id)
