@@ -373,6 +373,13 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
             le=100_000_000,
         ),
     ] = 60_000
+    alternate: Annotated[
+        bool,
+        Meta(
+            description="While the map grows use every second image where a camera hardly moves between them,"
+            " and colour twice as much with it."
+        ),
+    ] = True
     wait_frames: Annotated[
         int, Meta(description="Frames after which an image is used, if its surface is meshed.", ge=0, le=1000)
     ] = 6

@@ -17,6 +17,7 @@ from artemis_edge.frames import F32, F64, U8, CameraImage, CameraModel, TrackedF
 from artemis_edge.lens import undistorted_lines
 from artemis_edge.map_writer import gather_mesh
 from artemis_edge.refinement import texels as tx
+from artemis_edge.refinement.photographs import Alternate, Waiting
 from artemis_edge.refinement.stage import Refinement
 from tests import naive
 
@@ -24,7 +25,7 @@ WALL_X = 3.3
 MODEL = CameraModel(160, 120, 110.0, 112.0, 79.0, 61.0, (-0.1, 0.02, 0.001, -0.001, 0.0))
 # x forward of the world is z of the camera
 AXES = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-CALM = RefinementConfig(wait_frames=0, patience_frames=0, vignetting=False)
+CALM = RefinementConfig(wait_frames=0, patience_frames=0, vignetting=False, alternate=False)
 
 
 def colour_of(points: F64) -> F64:
@@ -137,7 +138,8 @@ def test_the_same_images_give_the_same_texture(tmp_path: Path) -> None:
 
 
 def test_meshing_anew_keeps_the_texture(scene: Scene) -> None:
-    scene.look((camera_image(photograph(pose())), pose()))
+    for _ in range(2):  # the first image finds out how much is in view
+        scene.look((camera_image(photograph(pose())), pose()))
     before = tx.used_texels(scene.refinement.texels)
     rng = np.random.default_rng(9)
     for _ in range(8):  # other points, other vertices, other triangles
@@ -241,6 +243,21 @@ def test_a_smeared_image_weighs_less() -> None:
     assert sharpness(image, np.zeros(6)) == 1.0
     assert sharpness(image, turn) == pytest.approx(1.0 / (5.0 * 0.01 * 110.0) ** 2)
     assert sharpness(replace(image, exposure_s=0.0), turn) == 1.0
+
+
+def test_every_second_image_is_used_where_the_camera_hardly_moves() -> None:
+    image = camera_image(np.zeros((120, 160, 3), np.uint8))
+
+    def taken(wanted: bool, places: list[tuple[str, float]]) -> list[bool]:
+        chooser = Alternate(wanted)
+        return [chooser.takes(Waiting(replace(image, name=n), pose(y), np.zeros(6), 0)) for n, y in places]
+
+    still = [("a", 0.0)] * 5
+    assert taken(True, still) == [True, False, True, False, True]
+    assert taken(False, still) == [True] * 5
+    assert taken(True, [("a", 0.0), ("b", 0.0), ("a", 0.0), ("b", 0.0)]) == [True, True, False, False]
+    assert taken(True, [("a", 0.5 * k) for k in range(4)]) == [True] * 4
+    assert taken(True, [("a", 0.0), ("a", 0.0), ("a", 1.0)]) == [True, False, True]
 
 
 def test_images_wait_until_their_surface_is_meshed(tmp_path: Path) -> None:

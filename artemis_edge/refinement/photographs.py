@@ -15,6 +15,8 @@ from artemis_edge.frames import F64, U8, CameraImage, CameraModel, TrackedFrame
 _LEAST_USABLE = 0.02
 _LOOKED_AT_EVERY = 8  # pixels, to judge that
 _BLACK, _CLIPPED = 4, 250
+# A hand that walks moves 0.1 to 0.15 m and turns up to 0.1 rad between two images at 10 Hz
+_HARDLY_M, _HARDLY_RAD = 0.2, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,30 @@ def decode(image: CameraImage, refused: Refused) -> U8 | None:
 
 
 @dataclass(slots=True)
+class Alternate:
+    """Chooses images of a map that grows: every second one where a camera hardly moves from one to the next.
+
+    Two photographs from nearly the same place tell little more than one, and to see what a photograph shows costs
+    the same however little of it is used. ``images`` is for how many each that is taken stands. Unless ``wanted``
+    all are taken.
+    """
+
+    wanted: bool
+    images: int = 1
+    _last: dict[str, tuple[F64, bool]] = field(default_factory=dict)
+
+    def takes(self, waiting: Waiting) -> bool:
+        """Whether an image is used; to be asked of all, in order."""
+        name, T = waiting.image.name, waiting.T_world_cam
+        last, skipped = self._last.get(name, (None, True))
+        near = self.wanted and last is not None and is_near(last, T, _HARDLY_M, _HARDLY_RAD)
+        take = skipped or not near
+        self._last[name] = T, not take
+        self.images = 2 if near else 1
+        return take
+
+
+@dataclass(slots=True)
 class Keyframes:
     """Images kept on disk, at most ``most``, each from another place than the one before.
 
@@ -101,7 +127,8 @@ class Keyframes:
     def offer(self, waiting: Waiting) -> bool:
         """Keep an image if it was taken far enough from the last one kept of its camera."""
         last = self._last.get(waiting.image.name)
-        if self.most == 0 or (last is not None and self._is_near(last, waiting.T_world_cam)):
+        near = last is not None and is_near(last, waiting.T_world_cam, self.apart_m, self.apart_rad)
+        if self.most == 0 or near:
             return False
         self.folder.mkdir(parents=True, exist_ok=True)
         with self._path.open("ab") as file:
@@ -149,7 +176,8 @@ class Keyframes:
     def _path(self) -> Path:
         return self.folder / "colour_keyframes.bin"
 
-    def _is_near(self, a: F64, b: F64) -> bool:
-        turn = math.acos(min(max((float(np.trace(a[:3, :3].T @ b[:3, :3])) - 1.0) / 2.0, -1.0), 1.0))
-        away = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
-        return away < self.apart_m and turn < self.apart_rad
+
+def is_near(a: F64, b: F64, apart_m: float, apart_rad: float) -> bool:
+    """Whether two poses (4, 4) are closer than a distance and an angle."""
+    turn = math.acos(min(max((float(np.trace(a[:3, :3].T @ b[:3, :3])) - 1.0) / 2.0, -1.0), 1.0))
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])) < apart_m and turn < apart_rad

@@ -18,7 +18,7 @@ from artemis_edge.refinement.atlas_builder import build_atlas
 from artemis_edge.refinement.colours import exposure_of, little_known, update_vertices
 from artemis_edge.refinement.exposure import SHADES, Exposures, undoing
 from artemis_edge.refinement.painting import new_brush, paint
-from artemis_edge.refinement.photographs import Keyframes, Refused, Waiting, arrivals, decode
+from artemis_edge.refinement.photographs import Alternate, Keyframes, Refused, Waiting, arrivals, decode
 from artemis_edge.refinement.reliability import PARTS, Trust, new_observations
 from artemis_edge.refinement.texel_pages import TexelPages
 from artemis_edge.refinement.view import View, Viewer
@@ -28,6 +28,9 @@ from artemis_edge.voxel_map import VoxelMap
 _UNMESHED = 0.1
 _EVERYTHING = 1 << 16  # more than any texel's information as stored
 _LEARNT = (4, 8, 16, 32)  # keyframes after which the lenses' fall-off is found
+_FIRST_IN_VIEW = (
+    1e6  # texels that the first image is taken to see, many: it must not cost more than the others
+)
 _LITTLE = 4.0  # good observations, below which keyframes are asked again at the end
 # Change of a lens's fall-off, in logarithm, from which on colours taken with the old one must give way, and what they
 # are worth then, in good observations
@@ -67,15 +70,16 @@ class Refinement:
         self._config, self._map = config, voxel_map
         self._brush = new_brush(voxel_map.config.voxel_m, config.texel_px, config.finest_texel_m)
         self._waiting: deque[Waiting] = deque()
+        self._used = Alternate(config.alternate)
         self._looks = 0
-        self._in_view = 0.0
+        self._in_view = _FIRST_IN_VIEW
         self._exposures = Exposures(config.vignetting)
         self._falloff: dict[str, F64] = {}
         self._shades: dict[str, F32] = {}
 
     def update(self, frame: TrackedFrame, stamp: int) -> None:
         """Take the images of a frame and use those whose turn has come."""
-        self._waiting.extend(arrivals(frame, stamp, self.refused))
+        self._waiting.extend(filter(self._used.takes, arrivals(frame, stamp, self.refused)))
         most = 2 * max(len(frame.images), 1)  # of those that waited, so that one frame never pays for many
         while self._waiting and most > 0 and self._is_due(self._waiting[0], stamp):
             waiting = self._waiting.popleft()
@@ -170,7 +174,8 @@ class Refinement:
         model = waiting.image.model
         clear = sharpness(waiting.image, waiting.twist)
         learn = learn and self._config.vignetting and len(self._exposures) < _LEARNT[-1]
-        some = None if learn or gain is not None else self._looks
+        # what is learnt must be of the same vertices from image to image
+        some = None if gain is not None else 0 if learn else self._looks
         view = self.viewer.look(pixels, model, waiting.T_world_cam, clear, some)
         if learn:
             self._learn(waiting, view)
@@ -198,7 +203,7 @@ class Refinement:
 
     def _part(self) -> int:
         """How many of ``PARTS`` of the surface the next image colours, by how much the last one had in view."""
-        wanted = self.share * self._config.most_texels / max(self._in_view, 1.0)
+        wanted = self.share * self._used.images * self._config.most_texels / max(self._in_view, 1.0)
         return int(min(max(round(wanted * PARTS), 1), PARTS))
 
 
