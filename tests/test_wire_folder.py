@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from artemis_edge.errors import InputError
-from artemis_edge.session.wire_replay import Played, WireRig, _write_rig
+from artemis_edge.session.wire_replay import Played, WireRig, _write_rig, read
+from tests import small_session
 
 
 def test_a_file_is_no_folder_for_devices(tmp_path: Path) -> None:
@@ -45,3 +48,19 @@ def test_its_own_rig_file_is_replaced_until_it_is_changed(tmp_path: Path) -> Non
     with pytest.raises(InputError, match="was changed since"):
         _write_rig(file, b"a = 4\n")
     assert tomllib.loads(file.read_text()) == {"a": 2, "b": 3}
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_the_lidar_never_stops_in_the_middle_of_a_packet(tmp_path: Path, camera: bool) -> None:
+    """From standing still to the walk: stamps go on without a gap, wherever the walk begins."""
+    walk = read(small_session.write(tmp_path / "walk", frames=2, points=500, camera=camera))
+    rig = WireRig(walk, tmp_path / "rig")
+    rig.board.firmware.boot_ns = time.monotonic_ns() - 1_234_567
+    stream = rig._shots()
+    shots = [next(stream)]
+    rig.begin(0.1)
+    shots += stream
+    assert rig.start_ns is not None and shots[-2].start_ns == rig.start_ns
+    for before, after in pairwise(shots):
+        assert after.start_ns == before.start_ns + len(before.xyz) * 1_000_000_000 // 240_000
+    assert all(len(part.xyz) % 96 == 0 for part in shots) and rig.over.is_set()

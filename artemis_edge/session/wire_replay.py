@@ -45,6 +45,7 @@ from artemis_edge.trajectory import quaternion_from_matrix
 _WINDOW_NS = 100_000_000
 _SHOTS = round(SHOTS_PER_S * _WINDOW_NS / 1e9)
 _PACKET_SHOTS = 96
+_PACKET_NS = round(_PACKET_SHOTS * 1e9 / SHOTS_PER_S)
 _RETURNS = 3
 _LEAD_S = 12.0  # clocks settle in ten
 _TRIGGER_NS = 100_000_000
@@ -187,13 +188,20 @@ class WireRig:
     def begin(self, lead_s: float = _LEAD_S) -> None:
         """Walk off. The photographs of the session were taken at times of their own: triggers fall on these."""
         earliest = time.monotonic_ns() + round(lead_s * 1e9)
-        start = earliest
-        if self.played.photos:
-            mid, exposure, _ = self.played.photos[0]
-            edge = mid - self.played.start_ns - exposure // 2  # after the start
-            boot = self.board.firmware.boot_ns
-            start += -(earliest + edge - boot) % _TRIGGER_NS
-        self.start_ns = start
+        every = _TRIGGER_NS if self.played.photos else _PACKET_NS
+        self.start_ns = earliest + (self._phase_ns() - earliest) % every
+
+    def _phase_ns(self) -> int:
+        """The walk begins whole periods of the triggers after this time, and packets begin whole packets after it.
+
+        A LiDAR never stops in the middle of a packet: what was shown while the rig stood still ends where the walk
+        begins.
+        """
+        if not self.played.photos:
+            return 0
+        mid, exposure, _ = self.played.photos[0]
+        edge = mid - self.played.start_ns - exposure // 2  # after the start
+        return self.board.firmware.boot_ns - edge
 
     def unplug_camera(self) -> None:
         """Pull its cable, which is its power as well."""
@@ -229,10 +237,11 @@ class WireRig:
     def _shots(self) -> Iterator[Shots]:
         """The first window again and again, then all of them."""
         still, at = _placed(self.played.windows[0]), time.monotonic_ns()
+        at -= (at - self._phase_ns()) % _PACKET_NS
         while self.start_ns is None or self.start_ns - at > _WINDOW_NS:
             yield Shots(at, *still)
             at += _WINDOW_NS
-        left = int((self.start_ns - at) * SHOTS_PER_S / 1e9) // _PACKET_SHOTS * _PACKET_SHOTS
+        left = (self.start_ns - at) // _PACKET_NS * _PACKET_SHOTS
         if left > 0:
             yield Shots(at, *(part[:left] for part in still))
         for window in self.played.windows:
