@@ -65,7 +65,7 @@ class Batch:
         from distributed import Event
 
         name = f"artemis-edge-{uuid.uuid4().hex}"
-        self._client, self._requests = client, requests
+        self._requests = requests
         self._stopped = Event(name, client=client)
         self._asked = 0
         self._attempts = [0] * len(requests)

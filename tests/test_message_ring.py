@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from artemis_edge.service.outlet import Outlet
 from artemis_edge.session.message_ring import MessageRing, OverwrittenError, RingReader
 
 ROOM_MB = 0.066  # the smallest ring
@@ -101,3 +102,11 @@ def test_a_reader_never_takes_half_a_message() -> None:
             taken += 1
     thread.join()
     assert taken + reader.lost == 3000 and taken > 0
+
+
+def test_what_can_never_fit_is_counted_and_told() -> None:
+    outlet = Outlet(MessageRing.create(ROOM_MB))
+    outlet.is_open = True
+    outlet.send_encoded("/a", "t", bytes(1_000_000), 0)
+    outlet.send_encoded("/a", "t", b"small", 0)
+    assert outlet.lost == {"messages_too_large": 1} and outlet.sent == {"/a": 1}

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -95,6 +96,13 @@ class Scene:
 @pytest.fixture
 def scene(tmp_path: Path) -> Scene:
     return Scene(tmp_path)
+
+
+def test_no_image_colours_the_map_where_that_is_turned_off(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, msgspec.structs.replace(CALM, enabled=False))
+    scene.look((camera_image(photograph(pose())), pose()))
+    _, atlas = scene.textured()
+    assert len(scene.colours()[0]) == 0 and not atlas.pages
 
 
 def sample(mesh: Mesh, atlas: Atlas, at: F32) -> tuple[F64, F64]:

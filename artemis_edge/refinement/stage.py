@@ -79,7 +79,8 @@ class Refinement:
 
     def update(self, frame: TrackedFrame, stamp: int) -> None:
         """Take the images of a frame and use those whose turn has come."""
-        self._waiting.extend(filter(self._used.takes, arrivals(frame, stamp, self.refused)))
+        if self._config.enabled:
+            self._waiting.extend(filter(self._used.takes, arrivals(frame, stamp, self.refused)))
         most = 2 * max(len(frame.images), 1)  # of those that waited, so that one frame never pays for many
         while self._waiting and most > 0 and self._is_due(self._waiting[0], stamp):
             waiting = self._waiting.popleft()

@@ -366,7 +366,7 @@ class Daemon:
             ],
             "clocks": capture.clocks(),
             "pairing": capture.counts(),
-            "lost": dict(capture.lost),
+            "lost": {**capture.lost, **self.outlet.lost},
             "windows": capture.windows,
             "sent": dict(self.outlet.sent),
             "disk": {

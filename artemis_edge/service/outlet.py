@@ -25,14 +25,14 @@ class Outlet:
     """Publishes while a session is recorded (``open`` to ``close``), from one thread; events from any.
 
     The log time of a message is the host's monotonic clock plus ``wall_ns``, the wall clock's lead when the service
-    began: it never jumps. ``too_large`` counts messages that do not fit the ring.
+    began: it never jumps. ``lost`` counts messages that can never fit the ring.
     """
 
     def __init__(self, ring: MessageRing) -> None:
         self.ring = ring
         self.wall_ns = time.time_ns() - time.monotonic_ns()
         self.is_open = False
-        self.too_large = 0
+        self.lost: Counter[str] = Counter()
         self.sent: Counter[str] = Counter()
         self._last_ns = 0
         self._lock = threading.RLock()
@@ -54,7 +54,7 @@ class Outlet:
             try:
                 self.ring.publish(topic, ros_type, self._last_ns, stamp_ns, data)
             except ValueError:
-                self.too_large += 1
+                self.lost["messages_too_large"] += 1
                 return
             self.sent[topic] += 1
 

@@ -12,8 +12,6 @@ from artemis_drivers.imu_serial.link import Link, Port
 from artemis_drivers.imu_serial.mtdata2 import Message, Mid
 from artemis_drivers.imu_serial.settings import XSENS_BAUD_IDS, MtiSettings, SyncSetting, VectorNavSettings
 
-#: Items that time depends on: nothing should be recorded unless they are ``ok``.
-TIME_ITEMS = frozenset({"outputs", "sync", "binary output"})
 _TRIES = 3
 _ANSWER_S = 0.5
 _FIND_S = 0.15  # per attempt while the baud rate is searched

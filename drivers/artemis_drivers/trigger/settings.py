@@ -57,9 +57,6 @@ SERIAL = Entry("serial", 0x2011, 4, 0, 2**32 - 1, writable=False)
 CONFIG_CRC = Entry("config_crc", 0x2020, 4, 0, 2**32 - 1, writable=False)
 DICTIONARY = (RATE, PULSE, PHASE, PPS_WIDTH, CAMERA_MASK, FIRMWARE, SERIAL, CONFIG_CRC)
 
-#: Items that time depends on: nothing should be recorded unless they are ``ok``.
-TIME_ITEMS = frozenset({"rate_mhz", "phase_us", "pps_width_ms", "camera_mask", "config_crc"})
-
 
 def wanted(settings: TriggerSettings) -> dict[Entry, int]:
     """The value of each object that is written."""

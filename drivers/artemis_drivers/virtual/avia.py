@@ -21,8 +21,6 @@ from artemis_drivers.virtual.prisms import deflect
 POINTS_PER_SECOND = 240_000
 FRAME_S = 0.1
 LINES = 6
-FOV_HORIZONTAL = 70.4 * np.pi / 180
-FOV_VERTICAL = 77.2 * np.pi / 180
 WEDGE = np.radians([30.8856, 29.7735, 3.1351])
 RATE_HZ = np.array([-131.5463, 40.8032, 213.1611])
 INDEX = 1.51

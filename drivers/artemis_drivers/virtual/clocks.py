@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
-U64 = NDArray[np.uint64]
 _INVERSE_STEPS = 6  # each divides the error by more than a thousand
 _WANDER_S = (37.0, 151.0, 619.0)  # periods of the sines: warming up, draughts, the room
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
