@@ -169,6 +169,7 @@ def _mesh(photo: Photo, picture: F32, covered: Bool) -> tuple[Likeness, Likeness
 
 def run(map_path: Path, photos: Path, report: Report = silent) -> TextureEvaluation:
     """The command ``evaluate texture``; raises InputError for files that are not what they should be."""
+    count_photos(photos)  # a wrong file is told before minutes of work
     mesh, atlas = open_map(map_path)
     folder = map_folder(map_path)
     splats = None if folder is None else open_splats(folder, report)

@@ -81,7 +81,7 @@ class Refinement:
         """Take the images of a frame and use those whose turn has come."""
         if self._config.enabled:
             self._waiting.extend(filter(self._used.takes, arrivals(frame, stamp, self.refused)))
-        most = 2 * max(len(frame.images), 1)  # of those that waited, so that one frame never pays for many
+        most = max(len(frame.images), 1)  # of those that waited: one frame never pays for many
         while self._waiting and most > 0 and self._is_due(self._waiting[0], stamp):
             waiting = self._waiting.popleft()
             self._fuse(waiting, _EVERYTHING, learn=self.keyframes.offer(waiting))
