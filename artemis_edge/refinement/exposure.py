@@ -8,6 +8,7 @@ map alone would hand on the errors of those before it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,24 +53,49 @@ class Exposures:
         self._camera.append(self._cameras.setdefault(name, len(self._cameras)))
 
     def solve(self) -> tuple[F32, dict[str, F64]]:
-        """Gain of each image to a common exposure, float32 (n, 3), and the fall-off of each camera's lens, float64
-        (``_POWERS``,), as ``lens.log_falloff`` takes it.
-        """
-        n = len(self)
-        place = np.unique(np.concatenate(self._slot), return_inverse=True)[1]
-        image = np.repeat(np.arange(n), [len(rows) for rows in self._slot])
-        shared = np.bincount(place)[place] > 1
-        place = np.unique(place[shared], return_inverse=True)[1]
-        image = image[shared]
-        colour = np.concatenate(self._colour)[shared].astype(np.float64)
-        r2 = np.concatenate(self._radius2)[shared]
-        camera = np.array(self._camera)[image]
-        falloff = np.zeros((len(self._cameras), _POWERS))
+        """Gain of each image to a common exposure, float32 (n, 3), and the fall-off of each camera's lens."""
+        c, falloff = self._common(), self.falloff()
+        colour = (
+            c.colour
+            - sum(
+                (log_falloff(a, c.r2) * (c.camera == k) for k, a in enumerate(falloff.values())),
+                np.zeros(len(c.r2)),
+            )[:, None]
+        )
+        gain = np.stack([_gains(c.place, c.image, colour[:, k], len(self)) for k in range(3)], axis=1)
+        return np.exp(gain).astype(np.float32), falloff
+
+    def falloff(self) -> dict[str, F64]:
+        """Of each camera's lens the fall-off, float64 (``_POWERS``,), as ``lens.log_falloff`` takes it."""
+        found = np.zeros((len(self._cameras), _POWERS))
         if self.vignetting:
-            falloff = _falloff(place, image, colour.mean(axis=1), r2, camera, len(self._cameras), n)
-        colour -= _shade(falloff[camera], r2)[:, None]
-        gain = np.stack([_gains(place, image, colour[:, k], n) for k in range(3)], axis=1)
-        return np.exp(gain).astype(np.float32), {name: falloff[k] for name, k in self._cameras.items()}
+            c = self._common()
+            found = _falloff(c.place, c.image, c.colour.mean(axis=1), c.r2, c.camera, len(found), len(self))
+        return {name: found[k] for name, k in self._cameras.items()}
+
+    def _common(self) -> _Common:
+        """What more than one image saw."""
+        image = np.repeat(np.arange(len(self)), [len(rows) for rows in self._slot])
+        place = np.unique(np.concatenate(self._slot), return_inverse=True)[1]
+        shared = np.bincount(place)[place] > 1
+        image = image[shared]
+        return _Common(
+            np.unique(place[shared], return_inverse=True)[1],
+            image,
+            np.array(self._camera)[image],
+            np.concatenate(self._colour)[shared].astype(np.float64),
+            np.concatenate(self._radius2)[shared],
+        )
+
+
+class _Common(NamedTuple):
+    """Observations of places that several images saw, one row each: ``colour`` (n, 3) in logarithm, ``r2`` (n,)."""
+
+    place: I64
+    image: I64
+    camera: I64
+    colour: F64
+    r2: F64
 
 
 def undoing(falloff: F64) -> F32:
@@ -86,12 +112,6 @@ def radius2(model: CameraModel, pixel: F32) -> F64:
 
 def _power_of_two(n: int) -> int:
     return 1 << (n - 1).bit_length()
-
-
-def _shade(falloff: F64, r2: F64) -> F64:
-    """Logarithm of the fall-off with coefficients (n or 1, ``_POWERS``) at r^2 (n,)."""
-    total: F64 = sum((falloff[:, k] * r2 ** (k + 1) for k in range(_POWERS)), np.zeros(len(r2)))
-    return total
 
 
 def _mean_by(key: I64, weight: F64, value: F64, n: int) -> F64:

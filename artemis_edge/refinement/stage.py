@@ -165,7 +165,7 @@ class Refinement:
         """Keep what a keyframe says of exposures; from time to time find the lenses' fall-off anew."""
         self._exposures.add(waiting.image.name, waiting.image.model, view.seen)
         if len(self._exposures) in _LEARNT:
-            self._set_falloff(self._exposures.solve()[1])
+            self._set_falloff(self._exposures.falloff())
 
     def _fuse(self, waiting: Waiting, enough: int, gain: F32 | None = None, learn: bool = False) -> None:
         pixels = decode(waiting.image, self.refused)
