@@ -51,7 +51,7 @@ layouts = st.lists(
 
 
 @given(st.lists(st.tuples(layouts, st.integers(1, 3)), max_size=6))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_a_stream_of_any_frames_gives_the_same_samples(
     stream: list[tuple[list[tuple[int, Precision]], int]],
 ) -> None:

@@ -1,5 +1,7 @@
 """Kernels of both packages are kept in one place, by our own rules."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 from artemis_drivers import _jit as drivers_jit
@@ -17,3 +19,21 @@ def test_both_packages_use_one_cache() -> None:
 
 def test_the_hash_is_that_of_all_sources() -> None:
     assert len(_jit.sources_hash()) == 16 and int(_jit.sources_hash(), 16) >= 0
+
+
+def test_the_service_starts_without_the_mapping() -> None:
+    """Its own process loads that: what the service needs at its start is there in a second or two."""
+    code = (
+        "import sys, artemis_edge.service.daemon as d; "
+        "print(sorted(m for m in sys.modules if m.startswith('artemis_edge.')))"
+    )
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    for name in (
+        "pipeline",
+        "mesher",
+        "odometry",
+        "service.mapper",
+        "service.segmenter",
+        "session.stream_mapping",
+    ):
+        assert f"'artemis_edge.{name}'" not in loaded, name
