@@ -8,7 +8,7 @@ LEARNT ?= train-out
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint bench soak wire ablation viewer-test terminal-test cluster-test train install-service clean
+.PHONY: help setup demo test lint bench soak wire ablation questions viewer-test terminal-test cluster-test train install-service clean
 
 help:
 	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
@@ -23,6 +23,7 @@ help:
 	@echo "make train   render views of the virtual worlds, train and export the shipped network (an hour or two, torch)"
 	@echo "make install-service   as root: the systemd service and what belongs to it (docs/operator.md)"
 	@echo "make ablation  the paper's ablations (Tables III and IV) on a virtual world"
+	@echo "make questions  questions to maps for what virtual worlds have and have not (some minutes)"
 	@echo "make setup   only create $(VENV); every target does it when needed"
 	@echo "make clean   remove $(VENV) and everything that was generated"
 
@@ -103,8 +104,12 @@ install-service: $(READY)
 	@test -n "$(ROOT)" || { systemctl daemon-reload; sysctl -q --system; udevadm control --reload; }
 	@echo "edit /etc/artemis/rig.toml, name the LiDAR's port in /etc/systemd/network/20-artemis-lidar.network, then:"
 	@echo "  systemctl enable --now artemis-can0 artemis-edge"
+
 ablation: $(READY)
 	@$(BIN)/python -m artemis_edge.session.ablation --out ablation-out
+
+questions: $(READY)
+	@$(BIN)/python tests/bench/bench_semantics.py absent --worlds street courtyard bench
 
 clean:
 	@rm -rf $(VENV) $(OUT) $(LEARNT) ablation-out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -19,7 +19,7 @@ from artemis_edge.segmentation.resolve import SlotTable, Understanding, understa
 from artemis_edge.segmentation.worker import Schedule, Scheduled
 from artemis_edge.segmentation.yolo_seg import Thresholds
 from artemis_edge.semantic_map import LateMask
-from artemis_edge.sight import Sight
+from artemis_edge.sight import Sight, without_depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,10 +124,10 @@ class BlankMasks:
         self._queue.append(sight)
 
     def ready(self) -> list[LateMask]:
-        """A mask for every image at once."""
+        """Two masks for every image at once: one as they come, and one as of an image from before its question."""
         slots = tuple(range(len(self.names) + 1))
         scores = DenseScores(slots, np.zeros((4, 4, len(slots)), np.uint8), Grid(0.01, 0.01, 0.0, 0.0))
-        out = [LateMask(sight, scores) for sight in self._queue]
+        out = [LateMask(view, scores) for sight in self._queue for view in (sight, without_depth(sight))]
         self._queue.clear()
         return out
 

@@ -128,19 +128,18 @@ class SemanticMap:
         view = new_sight(image.model, T_world_lidar @ inverse(image.T_cam_lidar))
         if not self.asked:
             return without_depth(view)
-        n = self._look(view)
+        n = self._look(without_depth(view))
         splat_depth(self._seen, n, view.lens[0], self._spacing_m, cell_px(view.lens), view.depth)
         return view
 
     def fuse(self, mask: LateMask, stamp: int) -> int:
         """Voxel fusion (eq. 1) of a mask; returns how many vertices it sees."""
         n = self._look(mask.sight)
-        lens, depth = mask.sight.lens, mask.sight.depth
-        if depth.size == 0:
+        if mask.sight.depth.size == 0:
             # an image from before the question: what stood in its way is what the map knows now
-            depth = empty_depth(lens)
+            lens, depth = mask.sight.lens, empty_depth(mask.sight.lens)
             splat_depth(self._seen, n, lens[0], self._spacing_m, cell_px(lens), depth)
-        n = int(keep_visible(self._seen, n, cell_px(lens), depth, visibility(self.config)))
+            n = int(keep_visible(self._seen, n, cell_px(lens), depth, visibility(self.config)))
         sampled = self._rows(n, mask.scores)
         sample_scores(self._seen, n, mask.scores.score, grid_of(mask.scores), sampled)
         fuse(
@@ -185,7 +184,8 @@ class SemanticMap:
 
     def _look(self, sight: Sight) -> int:
         blocks = self._blocks[: resident_blocks(self.store, self._blocks)]
-        return int(look(self.store, sight, blocks, self._block_m, self.config.reach_m, self._seen))
+        rules = visibility(self.config)
+        return look(self.store, sight, blocks, self._block_m, self.config.reach_m, rules, self._seen)
 
     def _rows(self, n: int, scores: DenseScores) -> F32:
         layers = scores.score.shape[2]

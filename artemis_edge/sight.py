@@ -30,6 +30,8 @@ DEPTH, INVERSE, RIGHT, DOWN = range(4)
 _FARTHEST = 2.0
 # Surfaces seen at a smaller cosine show a pixel of something else, and their planes have no depth to be followed
 LEAST_COSINE = 0.05
+# Depth errors of so many sigma_geom weigh nothing (below 4e-6): spares the exponential
+_NO_WEIGHT = 5.0
 _SPLAT = 0.75  # radius of a splat in point spacings: neighbouring splats overlap and leave no hole
 
 
@@ -61,6 +63,14 @@ class Seen(NamedTuple):
     cosine: F32  # between the line of sight and the normal, 0 when seen from behind
     depth_error: F32  # |depth - reference depth| [m], 0 where no reference is known
     reliability: F32  # W of eq. 9 from the depth alone, 0 where the surface is seen from behind
+
+
+class Visibility(NamedTuple):
+    """When a vertex in view is what its pixel shows."""
+
+    sigma_geom: float  # of eq. 9: relative depth error
+    least_reliability: float  # W below it is as good as 0
+    most_error_m: float  # depth error up to which eq. 1 takes it in
 
 
 def new_seen(cells: int) -> Seen:
@@ -101,35 +111,53 @@ def without_depth(sight: Sight) -> Sight:
     return sight._replace(depth=np.empty((0, 0, 4), np.float32))
 
 
-def look(store: Store, sight: Sight, blocks: I32, block_m: float, reach_m: float, seen: Seen) -> int:
+def look(
+    store: Store, sight: Sight, blocks: I32, block_m: float, reach_m: float, rules: Visibility, seen: Seen
+) -> int:
     """Living vertices of ``blocks`` (slots) within ``reach_m`` that ``sight`` shows into ``seen``; how many.
 
-    ``depth_error`` is left for :func:`keep_visible`.
+    Those that its reference depth hides are left out, as by :func:`keep_visible`. Where it has none all remain, and
+    ``depth_error`` and ``reliability`` are left for :func:`keep_visible`.
     """
-    return int(list_seen(store, sight, blocks, block_m, reach_m, seen))
+    planes = np.empty((6, 4))
+    view_planes(sight, reach_m, planes)
+    return int(list_seen(store, sight, planes, blocks, block_m, reach_m, cell_px(sight.lens), rules, seen))
 
 
 @kernel
-def list_seen(store: Store, sight: Sight, blocks: I32, block_m: float, reach_m: float, seen: Seen) -> int:
-    """Kernel of :func:`look`."""
-    T, lens = sight.T_cam_world, sight.lens
+def list_seen(
+    store: Store,
+    sight: Sight,
+    planes: F64,
+    blocks: I32,
+    block_m: float,
+    reach_m: float,
+    size_px: float,
+    rules: Visibility,
+    seen: Seen,
+) -> int:
+    """Kernel of :func:`look`; ``planes`` as of :func:`view_planes`."""
+    T, lens, depth = sight.T_cam_world, sight.lens, sight.depth
     n = 0
     for block in blocks:
-        if not _touches_view(store.block[block], sight, block_m, reach_m):
+        if not _touches_view(store.block[block], planes, block_m):
             continue
         for inner in range(512):
             voxel = store.block_voxel[block, inner]
-            if voxel < 0 or not _touches_view(store.voxel[voxel], sight, block_m / 8.0, reach_m):
+            if voxel < 0 or not _touches_view(store.voxel[voxel], planes, block_m / 8.0):
                 continue
             mask = store.voxel_mask[voxel]
             while mask != 0:
                 c = bs.lowest_bit(mask)
                 mask &= mask - np.uint64(1)
                 s = store.voxel_cell[voxel, c]
-                if store.state[s] == ALIVE and _project(store.vertex[s], T, lens, reach_m, seen, n):
-                    seen.slot[n] = s
-                    seen.voxel[n] = voxel
-                    n += 1
+                if store.state[s] != ALIVE or not _project(store.vertex[s], T, lens, reach_m, seen, n):
+                    continue
+                if depth.size > 0 and not _is_visible(seen, n, size_px, depth, rules):
+                    continue
+                seen.slot[n] = s
+                seen.voxel[n] = voxel
+                n += 1
     return n
 
 
@@ -145,22 +173,26 @@ def see_rows(vertex: F32, T: F64, lens: F64, reach_m: float, seen: Seen) -> int:
 
 
 @kernel
-def _touches_view(index: I32, sight: Sight, edge_m: float, reach_m: float) -> bool:
-    """Whether the sphere around a cube (a block, a voxel) of that ``index`` (3,) and edge reaches into the view."""
+def view_planes(sight: Sight, reach_m: float, out: F64) -> None:
+    """The six planes that bound the view, into ``out`` float64 (6, 4): unit normals that point in, and offsets [m]."""
     T, tangent = sight.T_cam_world, sight.tangent
+    for c in range(4):
+        out[0, c], out[1, c] = T[2, c], -T[2, c]
+        for k in range(2):
+            low, high = tangent[2 * k], tangent[2 * k + 1]
+            out[2 + 2 * k, c] = (T[k, c] - low * T[2, c]) / math.sqrt(1.0 + low * low)
+            out[3 + 2 * k, c] = (high * T[2, c] - T[k, c]) / math.sqrt(1.0 + high * high)
+    out[1, 3] += reach_m
+
+
+@kernel
+def _touches_view(index: I32, planes: F64, edge_m: float) -> bool:
+    """Whether the sphere around a cube (a block, a voxel) of that ``index`` (3,) and edge reaches into the view."""
     cx, cy, cz = (index[0] + 0.5) * edge_m, (index[1] + 0.5) * edge_m, (index[2] + 0.5) * edge_m
-    radius = 0.8661 * edge_m
-    x = T[0, 0] * cx + T[0, 1] * cy + T[0, 2] * cz + T[0, 3]
-    y = T[1, 0] * cx + T[1, 1] * cy + T[1, 2] * cz + T[1, 3]
-    z = T[2, 0] * cx + T[2, 1] * cy + T[2, 2] * cz + T[2, 3]
-    if z < -radius or z > reach_m + radius:
-        return False
-    for k in range(2):
-        along = x if k == 0 else y
-        low, high = tangent[2 * k], tangent[2 * k + 1]
-        if along - low * z < -radius * math.sqrt(1.0 + low * low):
-            return False
-        if along - high * z > radius * math.sqrt(1.0 + high * high):
+    least = -0.8661 * edge_m
+    for k in range(6):
+        p = planes[k]
+        if p[0] * cx + p[1] * cy + p[2] * cz + p[3] < least:
             return False
     return True
 
@@ -174,7 +206,8 @@ def _project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> b
         return False
     cx = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
     cy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-    x, y = cx / z, cy / z
+    nearness = 1.0 / z
+    x, y = cx * nearness, cy * nearness
     r2 = x * x + y * y
     if r2 > lens[11]:
         return False
@@ -187,14 +220,15 @@ def _project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> b
     nx = T[0, 0] * gx + T[0, 1] * gy + T[0, 2] * gz
     ny = T[1, 0] * gx + T[1, 1] * gy + T[1, 2] * gz
     nz = T[2, 0] * gx + T[2, 1] * gy + T[2, 2] * gz
-    facing = -(nx * cx + ny * cy + nz * z)
-    cosine = facing / (z * math.sqrt(r2 + 1.0))
+    facing = -(nx * x + ny * y + nz)
+    cosine = facing / math.sqrt(r2 + 1.0)
     seen.u[n], seen.v[n], seen.z[n] = u, v, z
     seen.cosine[n] = max(cosine, 0.0)
     # the inverse depth of a plane is linear in the image: n . ray / n . p
     steep = cosine < LEAST_COSINE
-    seen.right[n] = 0.0 if steep else -nx / (facing * lens[0])
-    seen.down[n] = 0.0 if steep else -ny / (facing * lens[1])
+    slope = 0.0 if steep else -nearness / facing
+    seen.right[n] = slope * nx / lens[0]
+    seen.down[n] = slope * ny / lens[1]
     return True
 
 
@@ -219,31 +253,32 @@ def splat_depth(seen: Seen, n: int, focal: float, spacing_m: float, size_px: flo
                     cell[RIGHT], cell[DOWN] = seen.right[i], seen.down[i]
 
 
-class Visibility(NamedTuple):
-    """When a vertex in view is what its pixel shows."""
-
-    sigma_geom: float  # of eq. 9: relative depth error
-    least_reliability: float  # W below it is as good as 0
-    most_error_m: float  # depth error up to which eq. 1 takes it in
-
-
 @kernel
 def keep_visible(seen: Seen, n: int, size_px: float, depth: F32, rules: Visibility) -> int:
     """Compare the vertices in view with the reference depth at their very pixels; only those remain that are what
     the image shows there, for eq. 1 or for eq. 9. Returns how many; ``depth_error`` and ``reliability`` are set."""
     kept = 0
     for i in range(n):
-        error = _depth_error(seen, i, size_px, depth)
-        relative = error / (max(seen.z[i] - error, NEAR_M) * rules.sigma_geom)
-        weight = math.exp(-0.5 * relative * relative) if seen.cosine[i] > LEAST_COSINE else 0.0
-        if error >= rules.most_error_m and weight < rules.least_reliability:
+        if not _is_visible(seen, i, size_px, depth, rules):
             continue
         seen.slot[kept], seen.voxel[kept] = seen.slot[i], seen.voxel[i]
         seen.u[kept], seen.v[kept], seen.z[kept] = seen.u[i], seen.v[i], seen.z[i]
         seen.cosine[kept] = seen.cosine[i]
-        seen.depth_error[kept], seen.reliability[kept] = error, weight
+        seen.depth_error[kept], seen.reliability[kept] = seen.depth_error[i], seen.reliability[i]
         kept += 1
     return kept
+
+
+@kernel
+def _is_visible(seen: Seen, i: int, size_px: float, depth: F32, rules: Visibility) -> bool:
+    """Whether row ``i`` is what its pixel shows, by its depth error and reliability, which are set."""
+    error = _depth_error(seen, i, size_px, depth)
+    weight = 0.0
+    if seen.cosine[i] > LEAST_COSINE:
+        relative = error / (max(seen.z[i] - error, NEAR_M) * rules.sigma_geom)
+        weight = math.exp(-0.5 * relative * relative) if relative < _NO_WEIGHT else 0.0
+    seen.depth_error[i], seen.reliability[i] = error, weight
+    return error < rules.most_error_m or weight >= rules.least_reliability
 
 
 @kernel

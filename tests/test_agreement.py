@@ -8,7 +8,7 @@ import numpy as np
 
 from artemis_edge.block_store import CLASSES
 from artemis_edge.frames import F32, I32, U8
-from artemis_edge.refinement.agreement import PRIOR, RAREST, ROUNDS, TEMPER, agreed
+from artemis_edge.refinement.agreement import ONE_IMAGE, PRIOR, RAREST, ROUNDS, TEMPER, agreed
 
 SPACING_M = 0.1
 ACTIVE = np.array([1, 1, 1] + [0] * 13, np.uint8)
@@ -37,8 +37,12 @@ def naive(lam: F32, active: U8, vertices: F32, normals: F32, faces: I32, beta: f
 
     own = {i: [float(lam[i, c]) for c in slots] for i in known}
     share = np.mean([softmax(own[i]) for i in known], axis=0)
+    told_of = {i: min((max(own[i]) - min(own[i])) / ONE_IMAGE, 1.0) for i in own}
     own = {
-        i: [TEMPER * (v + PRIOR * math.log(max(p, RAREST))) for v, p in zip(own[i], share, strict=True)]
+        i: [
+            TEMPER * (v + PRIOR * told_of[i] * math.log(max(p, RAREST)))
+            for v, p in zip(own[i], share, strict=True)
+        ]
         for i in own
     }
     told = dict(own)
@@ -86,6 +90,20 @@ def test_a_stray_vertex_gives_way_and_a_crease_is_a_border() -> None:
     lam[stray, 2] = 0.0
     label = agreed(lam, ACTIVE, vertices, normals, faces, SPACING_M, 3.0)[:, :3].argmax(axis=1)
     assert (label == np.where(right, 2, 1)).all()
+
+
+def test_shares_settle_contradictions_and_not_what_nobody_has_told() -> None:
+    vertices, normals, _ = sheet(10)
+    lam = np.full((len(vertices), CLASSES), -20.0, np.float32)
+    left = vertices[:, 0] < 0.15  # few are of class 1, most of class 2
+    lam[np.arange(len(lam)), np.where(left, 1, 2)] = 0.0
+    alone = np.zeros((0, 3), np.int32)
+    doubtful, silent = 5, 7
+    for vertex, depth in ((doubtful, -20.0), (silent, -0.4)):
+        lam[vertex] = depth
+        lam[vertex, 1:3] = 0.0, -0.3
+    label = agreed(lam, ACTIVE, vertices, normals, alone, SPACING_M, 3.0)[:, :3].argmax(axis=1)
+    assert label[doubtful] == 2 and label[silent] == 1
 
 
 def test_nothing_to_agree_on_changes_nothing() -> None:

@@ -16,11 +16,12 @@ from artemis_edge.sight import (
     Visibility,
     cell_px,
     keep_visible,
-    list_seen,
+    look,
     new_seen,
     new_sight,
     see_rows,
     splat_depth,
+    without_depth,
 )
 
 CAMERA = CameraModel(320, 256, 225.0, 225.0, 160.0, 128.0)
@@ -134,5 +135,13 @@ def test_blocks_and_voxels_that_are_passed_over_hold_nothing_in_view() -> None:
     sight, every = new_sight(CAMERA, LEVEL), new_seen(len(store.state))
     wanted = set(every.slot[: see_rows(rows, sight.T_cam_world, sight.lens, 40.0, every)].tolist())
     blocks = np.arange(store.counter[bs.N_BLOCKS], dtype=np.int32)
-    n = int(list_seen(store, sight, blocks, 3.2, 40.0, every))
+    size = cell_px(sight.lens)
+    n = look(store, without_depth(sight), blocks, 3.2, 40.0, RULES, every)
     assert set(every.slot[:n].tolist()) == wanted and 20 < n < n_cells
+    splat_depth(every, n, sight.lens[0], SPACING_M, size, sight.depth)
+    kept = int(keep_visible(every, n, size, sight.depth, RULES))
+    at_once = new_seen(len(store.state))
+    assert look(store, sight, blocks, 3.2, 40.0, RULES, at_once) == kept < n
+    for column, same in zip(every, at_once, strict=True):
+        if column is not every.right and column is not every.down:  # only splats need them
+            np.testing.assert_array_equal(column[:kept], same[:kept])

@@ -5,24 +5,31 @@ places (``semantic_constraint.py``); when it is finished, by their distributions
 images said against what its neighbours on the same surface are. What images get wrong of one vertex (its pixel
 shows what lies behind a silhouette, a mask was of another class) they seldom get wrong of all its neighbours alike.
 
-    lambda_i <- tau (lambda_i + k log pi) + beta sum_j w_ij P_j,    w_ij = max(n_i . n_j, 0)^2 min(r / L_ij, 1)
+    lambda_i <- tau (lambda_i + k s_i log pi) + beta sum_j w_ij P_j,    w_ij = max(n_i . n_j, 0)^2 min(r / L_ij, 1)
 
 pi are the shares of the classes in the map: where a few images contradict each other, it is more likely the wall
-that most of the map is. Edges to another surface (a crease, a border seen as one) weigh little or nothing.
+that most of the map is. s_i, 0..1, is how much images have told of the vertex: where they contradict each other, that
+is much, and where none has said anything yet, its neighbours know better than the shares. Edges to another surface
+(a crease, a border seen as one) weigh little or nothing.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from artemis_edge.frames import F32, I32, U8
+from artemis_edge.refinement.semantics import FLOOR
 
 # tau: of what images say so much counts. Views of a vertex resemble each other and err alike; eq. 12 takes them as
 # independent
 TEMPER = 0.25
 # Exponent of pi: with 1, thin things whose images waver between them and what is behind them give way to that
 PRIOR = 0.5
+# What one image that is sure tells a class from another by, natural logarithm (eq. 12): from there on s_i is 1
+ONE_IMAGE = -math.log(FLOOR)
 # pi of a class that is nearly absent: no class is so rare that a handful of images could not find it
 RAREST = 1e-3
 # Rounds in which classes travel: one edge each
@@ -43,15 +50,16 @@ def agreed(
         return out
     own = _normal(lam[np.ix_(known, slots)])
     share = np.maximum(_softmax(own).mean(axis=0), np.float32(RAREST))
-    own = np.float32(TEMPER) * (own + np.float32(PRIOR) * np.log(share))
+    told = np.minimum(own.min(axis=1, keepdims=True) / np.float32(-ONE_IMAGE), np.float32(1.0))
+    own = np.float32(TEMPER) * (own + np.float32(PRIOR) * told * np.log(share))
     graph = np.float32(weight) * neighbours(vertices, normals, faces, known, spacing_m)
-    told = own
+    now = own
     for _ in range(ROUNDS):
-        told = own + graph @ _softmax(told)
-    told = _normal(told)
+        now = own + graph @ _softmax(now)
+    now = _normal(now)
     # all zeros would say that nobody has looked
-    told[(told == 0.0).all(axis=1), 1:] = np.float32(-1e-6)
-    out[np.ix_(known, slots)] = told
+    now[(now == 0.0).all(axis=1), 1:] = np.float32(-1e-6)
+    out[np.ix_(known, slots)] = now
     return out
 
 

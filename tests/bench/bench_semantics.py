@@ -7,8 +7,9 @@
 ``map``: IoU by class of the map of a walk, over all points that the LiDAR saw and over those that photographs show,
 and the wrong points by cause. ``touching``: a backpack on a bench beside a sitting person (world ``bench``); persons
 and benches are asked for, and how much of the backpacks is taken for one. ``absent``: questions for what a world has
-and for what it has not, put to a finished map; how many are answered with ``matched``. Without ``--model`` the masks of
-``map`` and ``touching`` are the true ones. Sessions in ``--out`` are used again. Poses are the true ones.
+and for what it has not, put to a finished map; how many are answered with ``matched`` (``make questions``). Without
+``--model`` the masks of ``map`` and ``touching`` are the true ones. Sessions in ``--out`` are used again. Poses are the
+true ones.
 """
 
 from __future__ import annotations
@@ -141,6 +142,15 @@ def questions(folder: Path, model: str, scratch: Path, sets: list[str]) -> dict[
     return out
 
 
+def verdict(results: dict[str, dict[str, dict[str, str]]]) -> Iterator[str]:
+    """All worlds together: how many questions for what is there, and for what is not, were answered as matched."""
+    for kind in ("present", "absent"):
+        status = [(name, reply.split()[0]) for said in results.values() for name, reply in said[kind].items()]
+        matched = sum(found == Status.MATCHED.value for _, found in status)
+        known = sum(name not in UNHEARD for name, _ in status)
+        yield f"{kind}: {matched} of {len(status)} matched; {known} of them are classes that the network knows"
+
+
 def table(found: dict[str, Any]) -> Iterator[str]:
     """The figures for people."""
     for part in ("all", "shown"):
@@ -173,6 +183,8 @@ def main() -> int:
                 results[f"{world} {seed}"] = one(
                     given, session(world, seed, given.seconds, out), Path(scratch)
                 )
+    if given.what == "absent":
+        print(*verdict(results), sep="\n")
     if given.json is not None:
         given.json.write_text(json.dumps(results, indent=1) + "\n")
     return 0
