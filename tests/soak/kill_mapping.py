@@ -39,6 +39,7 @@ from tests.recordings import numbers
 
 _WITHIN_S = 10.0
 _PATIENCE_S = 900.0
+_CHECKPOINT_S = 4.0  # some checkpoints in a short session
 _TURN_S = 0.01
 _OWN = "/artemis/"  # topics of what the service says of itself, with its times
 _MAP = ("mesh.ply", "trajectory.tum", "objects.json", "map/blocks.bin")
@@ -140,7 +141,9 @@ def compare(session: Path, folder: Path, times: int) -> list[str]:
     (folder / "rig").mkdir()
     config = WireRig(played, folder / "rig").config()
     # what gives way under load would be another map, and be told in the recording
-    service = msgspec.structs.replace(config.service, overload=False, reserve_mb=0)
+    service = msgspec.structs.replace(
+        config.service, overload=False, reserve_mb=0, checkpoint_s=_CHECKPOINT_S
+    )
     config = msgspec.structs.replace(config, service=service)
     sent, frames = list(messages(session)), len(played.windows)
     killer = Killer([frames * (k + 1) // (times + 1) for k in range(times)])
