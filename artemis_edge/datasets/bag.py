@@ -14,7 +14,7 @@ from artemis_edge.session.cdr import Buffer, CdrError, CdrReader, Ros1Reader
 HEAD_BYTES = 256
 # For ``Bag.scan``: the whole message.
 WHOLE = -1
-_CACHE_BYTES = 64 << 20
+_CACHE_BYTES = 24 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Bag(Protocol):
 
 
 class ChunkCache:
-    """Decompressed chunks by position, the least recently used dropped beyond 64 MB.
+    """Decompressed chunks by position, the least recently used dropped beyond 24 MB.
 
     The messages of one frame lie in a few neighbouring chunks.
     """
