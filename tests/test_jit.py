@@ -1,9 +1,12 @@
 """Kernels of both packages are kept in one place, by our own rules."""
 
+import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from artemis_drivers import _jit as drivers_jit
 from artemis_drivers.livox_slots import track
 
@@ -37,3 +40,21 @@ def test_the_service_starts_without_the_mapping() -> None:
         "session.stream_mapping",
     ):
         assert f"'artemis_edge.{name}'" not in loaded, name
+
+
+@pytest.mark.skipif(
+    platform.machine() != "x86_64" or not drivers_jit._cpu_has_avx2(),
+    reason="compiled for the machine's own CPU",
+)
+def test_every_process_compiles_for_the_portable_cpu(tmp_path: Path) -> None:
+    """Else a child would compile what its parent does not find: numba keeps kernels apart by the CPU."""
+    compiles = (
+        "from artemis_edge._jit import njit; from numba import njit as plain; f = plain(lambda x: x + 1); f(1); "
+        "print(f.targetctx.codegen().magic_tuple()[1])"
+    )
+    child = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {compiles!r}], check=True)"
+    fresh = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
+    fresh["ARTEMIS_CACHE_DIR"] = str(tmp_path)
+    code = [sys.executable, "-c", f"{compiles}; print(flush=True); {child}"]
+    said = subprocess.run(code, check=True, capture_output=True, text=True, env=fresh).stdout.split()
+    assert said == ["x86-64-v3", "x86-64-v3"]

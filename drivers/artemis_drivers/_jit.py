@@ -80,13 +80,12 @@ def cache_dir() -> Path:
 
 
 def _configure() -> None:
-    folder = cache_dir()
-    os.environ["NUMBA_CACHE_DIR"] = str(folder)
-    numba.config.CACHE_DIR = str(folder)
+    """Set the environment, not numba.config alone: numba reads it anew as soon as it has changed."""
+    os.environ["NUMBA_CACHE_DIR"] = str(cache_dir())
     target = _PORTABLE_CPU.get(platform.machine())
     if target and "NUMBA_CPU_NAME" not in os.environ and _cpu_has_avx2():
-        numba.config.CPU_NAME = target
-        numba.config.CPU_FEATURES = ""
+        os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = target, ""
+    numba.config.reload_config()
 
 
 def _cpu_has_avx2() -> bool:
