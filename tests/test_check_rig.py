@@ -12,6 +12,7 @@ from artemis_drivers.livox_avia.settings import AviaConfig
 from artemis_drivers.udp import Interface
 
 from artemis_edge import check, check_rig
+from artemis_edge.errors import InputError
 from artemis_edge.service.settings import LidarEntry, RunConfig, ServiceSettings, load
 
 HOME = Interface("lo", IPv4Address("127.0.0.1"), IPv4Network("127.0.0.0/8"))
@@ -134,3 +135,12 @@ def test_check_with_a_rigs_profile_looks_at_its_devices(tmp_path: Path) -> None:
     wrong = tmp_path / "rig.toml"
     wrong.write_text("lidar = ['nobody']\n")
     assert any(f.status == "fail" and "nobody" in f.detail for f in check.check(wrong))
+
+
+def test_a_mount_that_is_no_rotation_is_refused_by_the_name_of_its_sensor(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text("[[lidar]]\navia = {}\nmount = {quaternion = [0.0, 0.0, 0.0, 0.0]}\n")
+    with pytest.raises(
+        InputError, match=r"lidar.*mount.*quaternion must not be zero|quaternion must not be zero.*lidar"
+    ):
+        load(path)

@@ -255,3 +255,15 @@ def test_warm_up_says_where_the_kernels_are(
     assert main(["warm-up"]) == 0
     assert asked == [(True, True)]
     assert capsys.readouterr().out == f"ready after 3 s; kept in {cache_dir()}\n"
+
+
+def test_run_refuses_a_session_that_is_there_before_it_waits_for_devices(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "session_000.mcap").write_bytes(b"something")
+    rig = tmp_path / "rig.toml"
+    rig.write_text("[[lidar]]\navia = {}\n")
+    for taken in (tmp_path / "walk", rig):
+        assert main(["run", "--config", str(rig), "--session", str(taken)]) == 2
+        assert "is there already" in capsys.readouterr().err

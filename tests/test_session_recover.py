@@ -18,7 +18,7 @@ from artemis_edge.cli import main
 from artemis_edge.datasets import open_input
 from artemis_edge.errors import InputError
 from artemis_edge.session.files import Limits, SessionFiles
-from artemis_edge.session.mcap_file import MAGIC, McapFile
+from artemis_edge.session.mcap_file import MAGIC, GrowingFile, McapFile
 from artemis_edge.session.recover import recover
 from artemis_edge.session.verify import verify
 from artemis_edge.session.writer import SessionWriter
@@ -243,3 +243,38 @@ def test_trim_keeps_the_part_and_what_holds_for_the_whole(tmp_path: Path) -> Non
     for late in ("9", "1e300"):
         assert main(["session", "trim", str(folder), "--from", late, "--out", str(tmp_path / "y")]) == 2
     assert not (tmp_path / "y").exists()
+
+
+def _spoil(path: Path, first: int, count: int = 60) -> None:
+    data = bytearray(path.read_bytes())
+    data[first : first + count] = bytes(255 - byte for byte in data[first : first + count])
+    path.write_bytes(data)
+
+
+def test_what_a_damaged_chunk_costs_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = _recording(tmp_path / "walk")
+    chunk = next(at for at, record in McapFile(path).records() if isinstance(record, Message))
+    _spoil(path, chunk + 60)
+    assert main(["session", "recover", str(tmp_path / "walk")]) == 0
+    said = capsys.readouterr().out
+    assert "8 of the 12 messages" in said and f"the record at byte {chunk} is damaged" in said
+    assert "was complete" not in said
+    out = tmp_path / "part"
+    assert main(["session", "trim", str(tmp_path / "walk"), "--out", str(out)]) == 1
+    assert f"missing: the record at byte {chunk} is damaged" in capsys.readouterr().out
+
+
+def test_what_holds_nothing_is_not_recovered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(3)
+    for name, content in (("nothing", MAGIC + rng.bytes(5000)), ("garbage", rng.bytes(5000)), ("empty", b"")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "session.mcap").write_bytes(content)
+        assert main(["session", "recover", str(tmp_path / name)]) in (1, 2)
+        assert capsys.readouterr().err.count("\n") == 1
+        assert not (tmp_path / f"{name}_recovered").exists()
+
+
+def test_a_damaged_length_ends_the_search_for_the_latest_message(tmp_path: Path) -> None:
+    path = tmp_path / "session_000.mcap"
+    path.write_bytes(MAGIC + b"\x06" + b"\xff" * 300)
+    assert GrowingFile(path).latest_number() == -1

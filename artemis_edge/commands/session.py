@@ -6,11 +6,13 @@ import argparse
 import math
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from artemis_edge.commands.common import DONE, FELL_SHORT, command, json_option, print_json
-from artemis_edge.errors import InputError
+from artemis_edge.errors import InputError, RunError
 
 _SECOND_NS = 1_000_000_000
 
@@ -102,38 +104,46 @@ def run_verify(given: argparse.Namespace) -> int:
 
 def run_recover(given: argparse.Namespace) -> int:
     """``artemis-edge session recover``."""
-    from artemis_edge.session.recover import SUFFIX, recover
+    from artemis_edge.session.recover import SUFFIX, faults, recover
     from artemis_edge.session.verify import verify
 
     source = _existing(given.session)
     out = given.out or source.with_name(f"{source.stem}{SUFFIX}{source.suffix}")
+    whole = set[Path]()
     if source.is_file():
         reports = [recover(source, out)]
     else:
-        _new_folder(out)
         whole = {verdict.path for verdict in verify(source) if not verdict.problems}
-        for file in sorted(whole):
-            _link(file, out / file.name)
-        reports = [
-            recover(file, out / file.name) for file in sorted(source.glob("*.mcap")) if file not in whole
-        ]
+        with _new_folder(out):
+            for file in sorted(whole):
+                _link(file, out / file.name)
+            others = [file for file in sorted(source.glob("*.mcap")) if file not in whole]
+            reports = [recover(file, out / file.name) for file in others]
+    if not whole and not any(report.messages for report in reports):
+        _take_back(reports, out)
+        raise RunError(f"no message of {source} is whole; there is nothing to recover")
     if given.json:
         print_json({"out": str(out), "files": [_copied(report) for report in reports]})
         return DONE
     for report in reports:
-        state = (
-            "was complete" if report.finished else f"was cut off, {report.torn_bytes} bytes could not be used"
-        )
-        print(f"{report.source} {state}; {report.messages} messages are in {report.copy}")
-        for problem in report.damaged:
+        of = f" of the {report.recorded}" if report.recorded > report.messages else ""
+        print(f"{report.messages}{of} messages of {report.source} are in {report.copy}")
+        for problem in faults(report):
             print(f"  {problem}")
-    print(f"{out}: complete")
+    print(f"{out}: can be read to its end")
     return DONE
+
+
+def _take_back(reports: list[Any], out: Path) -> None:
+    for report in reports:
+        report.copy.unlink()
+    if out.is_dir():
+        out.rmdir()
 
 
 def run_trim(given: argparse.Namespace) -> int:
     """``artemis-edge session trim``."""
-    from artemis_edge.session.recover import trim
+    from artemis_edge.session.recover import faults, trim
     from artemis_edge.session.verify import verify
 
     source = _existing(given.session)
@@ -148,14 +158,17 @@ def run_trim(given: argparse.Namespace) -> int:
     if source.is_file():
         reports = [trim(source, given.out, start, stop)]
     else:
-        _new_folder(given.out)
         kept = [verdict for verdict in verdicts if verdict.last_ns >= start and verdict.first_ns < stop]
-        reports = [trim(verdict.path, given.out / verdict.path.name, start, stop) for verdict in kept]
+        with _new_folder(given.out):
+            reports = [trim(verdict.path, given.out / verdict.path.name, start, stop) for verdict in kept]
+    problems = [problem for report in reports for problem in faults(report)]
     if given.json:
         print_json({"out": str(given.out), "files": [_copied(report) for report in reports]})
     else:
         print(f"{given.out}: {sum(report.messages for report in reports)} messages")
-    return DONE
+        for problem in problems:
+            print(f"  missing: {problem}")
+    return FELL_SHORT if problems else DONE
 
 
 def _nanoseconds(seconds: float) -> int:
@@ -169,6 +182,7 @@ def _copied(report: Any) -> dict[str, Any]:
         "copy": str(report.copy),
         "was_complete": report.finished,
         "messages": report.messages,
+        "recorded": report.recorded,
         "chunks": report.chunks,
         "attachments": report.attachments,
         "torn_bytes": report.torn_bytes,
@@ -183,10 +197,15 @@ def _existing(path: Path) -> Path:
     return path
 
 
-def _new_folder(path: Path) -> None:
+@contextmanager
+def _new_folder(path: Path) -> Iterator[None]:
+    """Made, and gone again where an error leaves nothing in it."""
+    from artemis_edge.session.results import preparing
+
     if path.exists():
         raise InputError(f"{path} is there already; remove it or give another --out")
-    path.mkdir(parents=True)
+    with preparing(path):
+        yield
 
 
 def _link(source: Path, copy: Path) -> None:

@@ -12,6 +12,7 @@ import signal
 import socket
 import sys
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from artemis_edge import health
 from artemis_edge.config import Config, from_toml
 from artemis_edge.continuing import find_earlier
 from artemis_edge.errors import UserError
+from artemis_edge.export.atomic import disk_sentence
 from artemis_edge.loop.relocate import Found
 from artemis_edge.orphans import end_with_the_parent
 from artemis_edge.service.checkpoint import Checkpoints
@@ -224,8 +226,20 @@ def _work(task: MapperTask, ring: MessageRing, channel: LineChannel) -> None:
         gc.freeze()
         gc.disable()
         mapper = LiveMapper(task, ring, channel, pages)
-        mapper.run()
+        _run(mapper)
         channel.say({"state": "saved", "pid": os.getpid(), **mapper.status(), **_told(mapper.save())})
+
+
+def _run(mapper: LiveMapper) -> None:
+    """All frames. A defect ends this process as a signal would: what its checkpoints go on from stays on the disk."""
+    try:
+        mapper.run()
+    except (UserError, ServiceGoneError, OSError):
+        raise
+    except Exception:
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(1)
 
 
 def _told(saved: dict[str, Any]) -> dict[str, Any]:
@@ -251,6 +265,10 @@ def main(arguments: list[str]) -> int:
         return 1
     except UserError as error:
         channel.say({"state": "failed", "fault": str(error)})
+        return 1
+    except OSError as error:
+        where = Path(str(error.filename or task.out))
+        channel.say({"state": "failed", "fault": disk_sentence(where, error)})
         return 1
     return 0
 

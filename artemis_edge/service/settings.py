@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,6 +32,11 @@ class Mount(Struct, frozen=True, forbid_unknown_fields=True):
 
     translation_m: Triple = (0.0, 0.0, 0.0)
     quaternion: Annotated[Quaternion, Meta(description="x, y, z, w.")] = (0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """ValueError for a quaternion that is no rotation; who reads the file names the sensor."""
+        if not 0.0 < sum(q * q for q in self.quaternion) < math.inf:
+            raise ValueError("the quaternion must not be zero")
 
     def matrix(self) -> F64:
         """T_parent_sensor (4, 4)."""

@@ -17,7 +17,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema, Statistics
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 
 from artemis_edge.errors import InputError
@@ -44,10 +44,11 @@ _CONTENT = {
     Opcode.ATTACHMENT: Attachment,
     Opcode.METADATA: Metadata,
     Opcode.CHUNK: Chunk,
+    Opcode.STATISTICS: Statistics,
 }
 
 #: What stands in a file: a chunk's content is given after it.
-# The library is untyped: Schema, Channel, Attachment, Metadata or Message.
+# The library is untyped: Schema, Channel, Attachment, Metadata, Statistics or Message.
 Content = Any
 
 
@@ -178,7 +179,7 @@ def _chunks(stream: IO[bytes]) -> list[tuple[int, int]]:
     while at + _RECORD.size <= end:
         opcode, size = _RECORD.unpack(stream.read(_RECORD.size))
         at += _RECORD.size + size
-        if opcode == 0:  # nothing was written here
+        if opcode == 0 or size > _RECORD_LIMIT:  # nothing was written here, or it is damaged
             break
         if opcode == Opcode.CHUNK and at <= end:
             found.append((at - size, size))

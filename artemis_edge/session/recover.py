@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema, Statistics
 from mcap.writer import CompressionType, Writer
 
 from artemis_edge import topics
@@ -21,12 +21,16 @@ SUFFIX = "_recovered"
 
 @dataclass(slots=True)
 class Copied:
-    """What was copied from ``source`` to ``copy``. ``lost`` by reason; ``damaged`` a sentence each."""
+    """What was copied from ``source`` to ``copy``. ``lost`` by reason; ``damaged`` a sentence each.
+
+    ``recorded`` is how many messages the source's own end says it has; 0 where that end is missing.
+    """
 
     source: Path
     copy: Path
     finished: bool = False
     messages: int = 0
+    recorded: int = 0
     chunks: int = 0
     attachments: int = 0
     first_ns: int = 0
@@ -72,6 +76,15 @@ def copied(source: Path, copy: Path, wanted: Callable[[Message], bool]) -> Copie
     return report
 
 
+def faults(report: Copied) -> list[str]:
+    """What of the source could not be read, a sentence each; none where all of it could."""
+    found = [*report.damaged]
+    if not report.finished:
+        found.append(f"{report.source} was cut off, {report.torn_bytes} bytes could not be used")
+    found += [f"{n} {reason.replace('_', ' ')} are left out" for reason, n in report.lost.items()]
+    return found
+
+
 @dataclass(slots=True)
 class _Declared:
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -100,6 +113,8 @@ def _copy(
             writer.add_attachment(
                 record.create_time, record.log_time, record.name, record.media_type, record.data
             )
+        elif isinstance(record, Statistics):
+            report.recorded = record.message_count
         elif isinstance(record, Metadata):
             writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Message):
