@@ -221,3 +221,24 @@ def test_raw_packets_give_way_when_the_disk_is_slow(tmp_path: Path) -> None:
     kept = numbers(tmp_path / "session_000.mcap")
     assert [k for k in kept if k % 2] == list(range(1, 100, 2))
     assert len(kept) + recorder.left_out == 100
+
+
+def test_a_slow_disk_is_given_time_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("artemis_edge.session.recorder._PATIENCE_S", 0.05)
+    monkeypatch.setattr("artemis_edge.session.recorder._BATCH", 5)
+    ours, theirs = socket.socketpair()
+    ring = MessageRing.create(4)
+    recorder = Recorder(RecorderTask(str(tmp_path), reserve_bytes=0), ring, LineChannel(ours))
+    for k in range(60):
+        publish(ring, sent(k))
+    theirs.close()
+    tend = recorder.files.tend
+
+    def slowly(files: SessionFiles) -> None:
+        time.sleep(0.02)
+        tend()
+
+    monkeypatch.setattr(SessionFiles, "tend", slowly)
+    recorder.run()
+    ours.close()
+    assert numbers(tmp_path / "session_000.mcap") == list(range(60))

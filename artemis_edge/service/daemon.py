@@ -47,7 +47,7 @@ _CAPTURE_STALE_S = 1.0  # a thread that turns a hundred times a second
 _RECORDER_STALE_S = 4.0
 _MAPPER_STALE_S = 20.0  # it may be in a long frame, and saving a large map it says nothing
 _SAVING_S = 30.0  # what is asked of systemd again and again while saving
-_DRAIN_S = 12.0
+_SILENT_S = 60.0  # a recorder that has said nothing for so long is stuck; it speaks as long as it writes
 _MARK_LONGEST = 500
 _NAME_LONGEST, _NAME_BYTES = 100, 240  # a file system takes 255 bytes
 _BUTTON_RECORD, _BUTTON_MARK = 0, 1
@@ -177,7 +177,6 @@ class Daemon:
         self.capture.stop()
         if session is not None:
             self._end_session()
-        drained = time.monotonic() + _DRAIN_S
         while self.session is not None:
             self._notify.extend(_SAVING_S)
             self._turn()
@@ -185,8 +184,9 @@ class Daemon:
                 asked = 1 << 30
                 if self.session is not None:
                     self.session.hurry()
-            if session is not None and session.recorder is not None and time.monotonic() > drained:
-                session.recorder.process.kill()
+            recorder = None if session is None else session.recorder
+            if recorder is not None and time.monotonic() - recorder.heard_s > _SILENT_S:
+                recorder.process.kill()  # another one goes on, with a time of its own
         self._lights.off()
         self.rig.stop_board()
         short = any(ended["fault"] for ended in self._ended_sessions)

@@ -263,7 +263,8 @@ class LiveSession:
             self.recorder = self._start_recorder(resume=True)
             if self.ended_s is not None:
                 self.recorder.tell("stop")
-            message = "the recorder ended; another goes on in a new file, where that one's ends"
+            why = f"exit code {child.process.returncode}"
+            message = f"the recorder ended ({why}); another goes on in a new file, where that one's ends"
             self._tell({"kind": "recorder_restarted", "message": message})
         elif child.process.returncode != 0:
             self.fault = self.fault or "the recorder keeps ending; see the log"

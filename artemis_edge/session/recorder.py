@@ -75,6 +75,10 @@ class Recorder:
             self.files.tend()
             self._hear()
             now = time.monotonic()
+            if (
+                busy and self._stop_at is not None
+            ):  # a slow disk is given time as long as something is written
+                self._deadline = now + _PATIENCE_S
             if now - self._said >= _SAY_S:
                 self._said = now
                 self._say("recording")
