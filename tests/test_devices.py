@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from artemis_edge.devices import importers
@@ -194,6 +194,7 @@ def test_wrong_yaml_is_named(text: str, says: str, tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.text(max_size=200))
+@example(":")  # a mapping whose name is nothing
 def test_any_text_is_refused_with_a_sentence(tmp_path: Path, text: str) -> None:
     path = tmp_path / "any"
     path.write_text(text, encoding="utf-8", errors="ignore")

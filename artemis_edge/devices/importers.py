@@ -36,7 +36,7 @@ def read_yaml(path: Path) -> _Tree:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except (YAMLError, UnicodeDecodeError, ValueError) as error:
         raise InputError(f"{path} is not valid YAML: {str(error).splitlines()[0]}") from None
-    if not isinstance(tree, dict):
+    if not isinstance(tree, dict) or not all(isinstance(name, str) for name in tree):
         raise InputError(f"{path} holds no calibration; give a camera chain or a FAST-LIVO2 file")
     return tree
 
