@@ -38,9 +38,7 @@ def run(given: argparse.Namespace) -> int:
 
     if given.go_on is not None and not (given.go_on.is_dir() and any(given.go_on.glob("*.mcap"))):
         raise InputError(f"{given.go_on} is no session; --continue needs the folder of a recording")
-    if given.session is not None and (
-        given.session.is_file() or (given.session.is_dir() and any(given.session.iterdir()))
-    ):
+    if given.session is not None and (given.session.is_file() or _holds_something(given.session)):
         raise InputError(f"{given.session} is there already; choose another --session, or --continue it")
     if given.seconds is not None and not given.seconds > 0:
         raise InputError(f"--seconds {given.seconds:g}: give a number above 0")

@@ -54,22 +54,21 @@ class Exposures:
 
     def solve(self) -> tuple[F32, dict[str, F64]]:
         """Gain of each image to a common exposure, float32 (n, 3), and the fall-off of each camera's lens."""
-        c, falloff = self._common(), self.falloff()
-        colour = (
-            c.colour
-            - sum(
-                (log_falloff(a, c.r2) * (c.camera == k) for k, a in enumerate(falloff.values())),
-                np.zeros(len(c.r2)),
-            )[:, None]
-        )
-        gain = np.stack([_gains(c.place, c.image, colour[:, k], len(self)) for k in range(3)], axis=1)
+        c = self._common()
+        falloff, bare = self._falloff_of(c), c.colour.copy()
+        for camera, coefficients in enumerate(falloff.values()):
+            own = c.camera == camera
+            bare[own] -= log_falloff(coefficients, c.r2[own])[:, None]
+        gain = np.stack([_gains(c.place, c.image, bare[:, k], len(self)) for k in range(3)], axis=1)
         return np.exp(gain).astype(np.float32), falloff
 
     def falloff(self) -> dict[str, F64]:
         """Of each camera's lens the fall-off, float64 (``_POWERS``,), as ``lens.log_falloff`` takes it."""
+        return self._falloff_of(self._common())
+
+    def _falloff_of(self, c: _Common) -> dict[str, F64]:
         found = np.zeros((len(self._cameras), _POWERS))
         if self.vignetting:
-            c = self._common()
             found = _falloff(c.place, c.image, c.colour.mean(axis=1), c.r2, c.camera, len(found), len(self))
         return {name: found[k] for name, k in self._cameras.items()}
 

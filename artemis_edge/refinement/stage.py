@@ -28,9 +28,8 @@ from artemis_edge.voxel_map import VoxelMap
 _UNMESHED = 0.1
 _EVERYTHING = 1 << 16  # more than any texel's information as stored
 _LEARNT = (4, 8, 16, 32)  # keyframes after which the lenses' fall-off is found
-_FIRST_IN_VIEW = (
-    1e6  # texels that the first image is taken to see, many: it must not cost more than the others
-)
+# Texels that the first image is taken to see, many: it must not cost more than the others
+_FIRST_IN_VIEW = 1e6
 _LITTLE = 4.0  # good observations, below which keyframes are asked again at the end
 # Change of a lens's fall-off, in logarithm, from which on colours taken with the old one must give way, and what they
 # are worth then, in good observations

@@ -42,9 +42,8 @@ class Desk:
         if not isinstance(text, str) or not text.strip():
             raise InputError("write what to look for, for example 'bench' or 'red car'")
         text = " ".join(text.split())
-        if any(
-            0xD800 <= ord(letter) < 0xE000 for letter in text
-        ):  # JSON can say it, UTF-8 and the recording cannot
+        # JSON can say half a character, UTF-8 and the recording cannot
+        if any(0xD800 <= ord(letter) < 0xE000 for letter in text):
             raise InputError("this question holds half a character (a lone surrogate); send it as UTF-8")
         if len(text) > LONGEST:
             raise InputError(f"a question has at most {LONGEST} characters; this one has {len(text)}")

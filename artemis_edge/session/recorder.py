@@ -75,9 +75,8 @@ class Recorder:
             self.files.tend()
             self._hear()
             now = time.monotonic()
-            if (
-                busy and self._stop_at is not None
-            ):  # a slow disk is given time as long as something is written
+            if busy and self._stop_at is not None:
+                # a slow disk is given time as long as something is written
                 self._deadline = now + _PATIENCE_S
             if now - self._said >= _SAY_S:
                 self._said = now

@@ -32,17 +32,12 @@ from artemis_edge.session.assembly import FrameAssembler
 from artemis_edge.session.late_masks import LateMasks
 from artemis_edge.session.late_odometry import LateOdometry
 from artemis_edge.session.message_ring import Sent
-from artemis_edge.session.messages import (
-    Mask,
-    Text,
-)
+from artemis_edge.session.messages import Mask, Text
 from artemis_edge.session.photos import HeldOut
 from artemis_edge.session.results import Results, prepare
 from artemis_edge.session.statistics import RunStatistics
 
 _NS_PER_MS = 1e6
-_WARM_UP_FRAMES = 4
-_FRAME_NS = 100_000_000
 _INPUT_HZ = 10.0
 _ABOUT_QUESTIONS = frozenset({topics.QUESTIONS.name, topics.MASKS.name})
 

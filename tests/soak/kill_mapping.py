@@ -17,7 +17,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,10 +31,10 @@ from artemis_edge.service.outlet import Outlet
 from artemis_edge.service.settings import RunConfig
 from artemis_edge.session.feed import messages
 from artemis_edge.session.message_ring import MessageRing, Sent
-from artemis_edge.session.simulate import simulate
 from artemis_edge.session.verify import verify
 from artemis_edge.session.wire_replay import WireRig, read
 from tests.recordings import numbers
+from tests.walks import given_or_simulated
 
 _WITHIN_S = 10.0
 _PATIENCE_S = 900.0
@@ -177,13 +176,7 @@ def main() -> int:
     options.add_argument("--seconds", type=float, default=20.0)
     options.add_argument("--times", type=int, default=2)
     given = options.parse_args()
-    with tempfile.TemporaryDirectory() as text:
-        folder = Path(text)
-        session = given.session
-        if session is None:
-            session = folder / "walk"
-            truth = dict.fromkeys(("reference", "point_truth", "mesh"), "off")
-            simulate("street", 1, given.seconds, "avia", session, truth)
+    with given_or_simulated(given.session, given.seconds) as (session, folder):
         wrong = compare(session, folder, given.times)
     print(
         "\n".join(wrong)

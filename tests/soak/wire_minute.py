@@ -16,7 +16,6 @@ import json
 import os
 import signal
 import sys
-import tempfile
 import time
 from collections import Counter
 from pathlib import Path
@@ -27,11 +26,11 @@ import msgspec
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from artemis_edge.service import settings
-from artemis_edge.session.simulate import simulate
 from artemis_edge.session.verify import verify
 from artemis_edge.session.wire_replay import Played, WireRig, read
 from tests.livox_ports import reserved
 from tests.waiting import until
+from tests.walks import given_or_simulated
 from tests.wire_service import Service
 
 _PATIENCE_S = 600.0
@@ -138,13 +137,7 @@ def main() -> int:
     options.add_argument("--seconds", type=float, default=60.0)
     options.add_argument("--no-mapping", dest="mapping", action="store_false")
     given = options.parse_args()
-    with tempfile.TemporaryDirectory() as text:
-        folder = Path(text)
-        session = given.session
-        if session is None:
-            session = folder / "walk"
-            truth = dict.fromkeys(("reference", "point_truth", "mesh"), "off")
-            simulate("street", 1, given.seconds, "avia", session, truth)
+    with given_or_simulated(given.session, given.seconds) as (session, folder):
         report = play(session, folder, given.seconds, mapping=given.mapping)
     print(json.dumps(report, indent=1))
     return 1 if report["lost"] or report["problems"] or report["code"] else 0

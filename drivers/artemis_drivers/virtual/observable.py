@@ -104,8 +104,7 @@ def remember(beams: F64, instance: I32, table: I32, kept: F64, kept_instance: I3
     for i in range(len(beams)):
         b = beams[i]
         key = _key(b[0], b[1], b[2], _THIN_M)
-        slot = (key ^ (np.int64(instance[i]) * 73856093)) * 0x2545F4914F6CDD1D
-        slot = (slot ^ (slot >> 32)) & mask
+        slot = _spread(key ^ (np.int64(instance[i]) * 73856093)) & mask
         while table[slot] >= 0:
             k = kept[table[slot]]
             if kept_instance[table[slot]] == instance[i] and _key(k[0], k[1], k[2], _THIN_M) == key:
@@ -252,11 +251,17 @@ def _hash_set(keys: I64) -> I64:
 
 
 @njit
+def _spread(key: int) -> int:
+    """A number whose low bits depend on all of a key's (multiplicative hashing)."""
+    k = key * 0x2545F4914F6CDD1D
+    return k ^ (k >> 32)
+
+
+@njit
 def _slot(table: I64, key: int) -> int:
     """Slot of a key, or of the empty place where it would stand (open addressing)."""
     mask = len(table) - 1
-    k = key * 0x2545F4914F6CDD1D
-    k = (k ^ (k >> 32)) & mask
+    k: int = _spread(key) & mask
     while table[k] != key and table[k] != -1:
         k = (k + 1) & mask
     return k
