@@ -179,3 +179,19 @@ def test_a_status_for_clients_names_the_report(tmp_path: Path) -> None:
         assert told["phase"] == "idle"
     finally:
         service.control.close()
+
+
+def test_ended_before_its_devices_were_there(tmp_path: Path) -> None:
+    """Its time is over while it waits: it has fallen short, and says so; a signal is no fault."""
+    config = msgspec.structs.replace(
+        _config(tmp_path), service=msgspec.structs.replace(_config(tmp_path).service, start_patience_s=60.0)
+    )
+    for signals, code in ((0, 1), (1, 0)):
+        with reserved():
+            turned = Turned(config)
+            turned.service._begin_checking(None)
+            turned.service._turn()
+            turned.service._signals = signals
+            assert turned.service._stop() == code
+            turned.service.control.close()
+        assert any("nothing was recorded: still waiting for lidar" in line for line in turned.log)

@@ -216,6 +216,8 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path.write_bytes(data[: len(data) * 2 // 3])
     assert main(["session", "verify", str(folder)]) == 1
     assert "session recover" in capsys.readouterr().out
+    assert main(["session", "list", str(tmp_path)]) == 0
+    assert "damaged (1 truncated_file): session recover makes a copy" in capsys.readouterr().out
     assert main(["session", "recover", str(folder)]) == 0
     assert (tmp_path / "walk_recovered" / "session.mcap").is_file()
     assert path.read_bytes() == data[: len(data) * 2 // 3]
@@ -224,6 +226,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["session", "list", str(tmp_path), "--json"]) == 0
     cards = json.loads(capsys.readouterr().out)["sessions"]
     assert [card["name"] for card in cards] == ["walk", "walk_recovered"]
+    assert [card["lost"] for card in cards] == [{}, {}]
     assert cards[0]["recorded"] == "2025-12-28 23:59:00" and cards[0]["duration_s"] == 2.9
     assert main(["session", "list", str(tmp_path / "nowhere")]) == 2
 

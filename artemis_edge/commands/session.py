@@ -62,13 +62,16 @@ def run_list(given: argparse.Namespace) -> int:
         print_json({"sessions": cards})
         return DONE
     for card in cards:
-        length = (
-            f"{card['duration_s']:8.1f} s  {card['bytes'] / 1e6:9.1f} MB" if card["problem"] is None else ""
-        )
-        print(f"{card['name']:<28} {card['recorded']}  {length}{card['problem'] or ''}")
+        print(f"{card['name']:<28} {card['recorded']}  {card['problem'] or _in_short(card)}")
     if not cards:
         print(f"no recordings in {given.folder}")
     return DONE
+
+
+def _in_short(card: dict[str, Any]) -> str:
+    damage = ", ".join(f"{count} {reason}" for reason, count in sorted(card["lost"].items()))
+    told = f"  damaged ({damage}): session recover makes a copy" if damage else ""
+    return f"{card['duration_s']:8.1f} s  {card['bytes'] / 1e6:9.1f} MB{told}"
 
 
 def run_info(given: argparse.Namespace) -> int:

@@ -171,6 +171,10 @@ class Daemon:
         self._notify.stopping()
         asked = self._signals
         session = self.session
+        in_vain = self.phase == Phase.CHECKING
+        if in_vain:
+            message = f"nothing was recorded: still waiting for {self._missing()} when it was to end"
+            self._tell({"kind": "warning", "message": message})
         if session is not None:
             self._lights.show(Phase.SAVING)
         self.rig.stop()
@@ -189,7 +193,7 @@ class Daemon:
                 recorder.process.kill()  # another one goes on, with a time of its own
         self._lights.off()
         self.rig.stop_board()
-        short = any(ended["fault"] for ended in self._ended_sessions)
+        short = any(ended["fault"] for ended in self._ended_sessions) or (in_vain and not self._signals)
         return 1 if short or self.fault else 0
 
     def _signalled(self, number: int, frame: FrameType | None) -> None:
@@ -209,13 +213,15 @@ class Daemon:
         if not ready and waited < self.config.service.start_patience_s:
             return
         if not ready:
-            missing = [h.name for h in self.capture.health() if h.state != State.RUNNING] or ["time"]
-            self._tell({"kind": "warning", "message": f"recording without {', '.join(missing)}"})
+            self._tell({"kind": "warning", "message": f"recording without {self._missing()}"})
         try:
             self._begin_session()
         except InputError as error:
             self._tell({"kind": "warning", "message": str(error)})
             self._become(Phase.IDLE)
+
+    def _missing(self) -> str:
+        return ", ".join([h.name for h in self.capture.health() if h.state != State.RUNNING] or ["time"])
 
     def _begin_session(self) -> None:
         folder = self._folder or session_folder(

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from artemis_edge.datasets import open_input
-from artemis_edge.datasets.bag import Connection, Entry
-from artemis_edge.datasets.common import SECOND_NS
+from artemis_edge.datasets.bag import Bag, Connection, Entry
+from artemis_edge.datasets.common import SECOND_NS, add_counts
 from artemis_edge.datasets.rosbag import bag_files, open_bags
 from artemis_edge.errors import UserError
 
@@ -75,7 +75,7 @@ class Catalog:
 def catalog(path: Path) -> Catalog:
     """Look through the recording at ``path``; InputError if there is none."""
     files = bag_files(path)
-    topics = _topics(path) if files else []
+    topics = _topics(open_bags(path)) if files else []
     try:
         source = open_input(path)
     except UserError as error:
@@ -92,13 +92,17 @@ def catalog(path: Path) -> Catalog:
 
 
 def card(path: Path) -> dict[str, Any]:
-    """A recording in a list: name, when it was recorded, length, size, and a sentence if it cannot be read."""
+    """A recording in a list: name, when recorded, length, size, what is lost, and a sentence if it cannot be read."""
     files = bag_files(path)
     found: dict[str, Any] = {"name": path.name, "path": str(path), "bytes": _size(files), "problem": None}
+    found["lost"] = {}
     try:
-        topics = _topics(path)
+        bags = open_bags(path)
+        topics = _topics(bags)
     except UserError as error:
         return {**found, "recorded": _NEVER, "duration_s": 0.0, "messages": 0, "problem": str(error)}
+    for bag in bags:
+        add_counts(found["lost"], bag.lost)
     first = min((topic.first_ns for topic in topics), default=0)
     recorded = datetime.fromtimestamp(first / SECOND_NS, UTC).strftime("%Y-%m-%d %H:%M:%S")
     return {
@@ -124,9 +128,9 @@ def to_text(catalog: Catalog) -> str:
     return "\n".join(lines)
 
 
-def _topics(path: Path) -> list[Topic]:
+def _topics(bags: Iterable[Bag]) -> list[Topic]:
     topics: dict[str, Topic] = {}
-    for bag in open_bags(path):
+    for bag in bags:
         entries: Iterable[Entry] = bag.scan(_glance)
         for entry in entries:
             name = entry.connection.topic
