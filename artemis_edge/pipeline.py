@@ -16,6 +16,7 @@ from artemis_edge.delta import Outbox
 from artemis_edge.export.atlas import write_atlas
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
+from artemis_edge.known_lenses import write_lenses
 from artemis_edge.load import Load
 from artemis_edge.map_writer import save_map, write_mesh, write_removed
 from artemis_edge.mesher import Mesher
@@ -217,7 +218,7 @@ class Pipeline:
 
     def save(self, folder: Path) -> int:
         """Write what reopens the map; returns its size in bytes."""
-        size = save_map(folder, self.pager, self.config)
+        size = save_map(folder, self.pager, self.config) + write_lenses(folder, self.refinement.lenses)
         if self.config.voxel_map.dynamic_filter:
             size += write_removed(folder, self.free_space.removed)
         if self._mesh is not None:

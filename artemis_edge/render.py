@@ -5,7 +5,8 @@ Used for reference depth maps, previews, pictures and ``artemis-edge render``. K
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,10 @@ from artemis_edge.export.ply import Mesh
 from artemis_edge.export.png import png_bytes
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraModel
 from artemis_edge.highlighted import highlighted_triangles
+from artemis_edge.known_lenses import known_falloff
+from artemis_edge.lens import falloff as left_by_lens
 from artemis_edge.lens import undistorted_lines
-from artemis_edge.opened_map import open_map
+from artemis_edge.opened_map import map_folder, open_map
 from artemis_edge.raster import NOTHING, Projection, draw, interpolate, project
 from artemis_edge.trajectory import inverse, matrix_from_quaternion
 
@@ -27,6 +30,8 @@ NEAR_M = 0.05
 # The canvas behind a lens is finer than the picture, so that borders fall within half a pixel of their place.
 _LENS_OVERSAMPLING = 2.0
 _LARGEST_CANVAS = 1 << 25
+# Where in a pixel the colours are taken whose mean it shows, beside its centre: the turned grid of multisampling
+_WITHIN_PX = ((0.125, 0.375), (0.375, -0.125), (-0.125, -0.375), (-0.375, 0.125))
 # What is highlighted keeps some of its own colour, so that it can be recognised.
 _TINT, _TINT_SHARE = np.array([255.0, 64.0, 0.0], np.float32), np.float32(0.6)
 _NO_VALUES = np.empty((0, 0), np.float32)
@@ -190,6 +195,26 @@ def render_coloured(mesh: Mesh, atlas: Atlas | None, camera: CameraModel, T_worl
     return seen
 
 
+def picture(
+    mesh: Mesh, atlas: Atlas | None, camera: CameraModel, T_world_cam: F64, falloff: Sequence[float] = ()
+) -> Rendering:
+    """As :func:`render_coloured`, as a camera takes it: a pixel gathers the light of its whole area, and of that the
+    lens leaves ``falloff`` (``lens.log_falloff``). What is covered, and the depth, are those of pixels' centres.
+    """
+    seen = render_coloured(mesh, atlas, camera, T_world_cam)
+    count = seen.covered.astype(np.float32)
+    for right, down in _WITHIN_PX:
+        moved = replace(camera, cx=camera.cx - right, cy=camera.cy - down)
+        part = render_coloured(mesh, atlas, moved, T_world_cam)
+        seen.values[:] += part.values
+        count += part.covered
+    share = np.where(seen.covered, 1.0 / np.maximum(count, np.float32(1.0)), np.float32(0.0))
+    if falloff:
+        share *= left_by_lens(camera, falloff)
+    seen.values[:] *= share[..., None]
+    return seen
+
+
 def _paint(sight: _Sight, faces: I32, atlas: Atlas, out: F32) -> None:
     shape = sight.triangle.shape
     page, uv = np.empty(shape, np.int32), np.zeros((*shape, 2), np.float32)
@@ -206,12 +231,13 @@ def overlay(
     T_world_cam: F64,
     atlas: Atlas | None = None,
     highlighted: Bool | None = None,
+    falloff: Sequence[float] = (),
 ) -> tuple[U8, F32]:
-    """RGBA uint8 (h, w, 4) of the map's colours, alpha 0 where nothing, and depth float32 (h, w).
+    """RGBA uint8 (h, w, 4) of :func:`picture`, alpha 0 where nothing, and depth float32 (h, w).
 
     ``highlighted`` bool (m,) names triangles to tint.
     """
-    seen = render_coloured(mesh, atlas, camera, T_world_cam)
+    seen = picture(mesh, atlas, camera, T_world_cam, falloff)
     colours = seen.values
     if highlighted is not None:
         tinted = seen.covered & highlighted[np.maximum(seen.triangle, 0)]
@@ -230,12 +256,17 @@ def run(
     out: Path,
     depth: Path | None = None,
     highlight: str | None = None,
+    falloff: bool = True,
 ) -> None:
-    """The command ``render``: texts as given there, PNG to ``out``, depth as .npy to ``depth``."""
+    """The command ``render``: texts as given there, PNG to ``out``, depth as .npy to ``depth``.
+
+    With ``falloff`` the picture of a camera of the map is darkened as its lens does.
+    """
     camera, T_world_cam = parse_camera(intrinsics, distortion), parse_pose(pose)
     mesh, atlas = open_map(map_path)
     chosen = None if highlight is None else highlighted_triangles(map_path, mesh, highlight)
-    rgba, z = overlay(mesh, camera, T_world_cam, atlas, chosen)
+    lens = known_falloff(map_folder(map_path), camera) if falloff else ()
+    rgba, z = overlay(mesh, camera, T_world_cam, atlas, chosen, lens)
     write_png(out, rgba)
     if depth is not None:
         with replacing(depth) as file:

@@ -1,6 +1,7 @@
 """Textured views against a ray caster with a slow sampler, highlighting, and the command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,10 +12,12 @@ from artemis_edge import render
 from artemis_edge.atlas_raster import sample_page
 from artemis_edge.cli import main
 from artemis_edge.errors import InputError
-from artemis_edge.export.atlas import UNTEXTURED, empty_atlas, write_atlas
+from artemis_edge.export.atlas import UNTEXTURED, Atlas, empty_atlas, write_atlas
 from artemis_edge.export.ply import bare_mesh, write_ply
 from artemis_edge.frames import CameraModel
 from artemis_edge.highlighted import highlighted_triangles
+from artemis_edge.known_lenses import known_falloff, write_lenses
+from artemis_edge.lens import falloff
 from artemis_edge.opened_map import open_map
 from artemis_edge.trajectory import matrix_from_quaternion
 from tests.textured import smooth_picture, square_room
@@ -125,12 +128,52 @@ def test_render_command_overlays_colour_alpha_and_depth(room: Path) -> None:
     assert main([*arguments, "--out", str(out), "--depth", str(depth)]) == 0
     image, z = cv2.imread(str(out), cv2.IMREAD_UNCHANGED), np.load(depth)
     mesh, atlas = square_room()
-    seen = render.render_coloured(mesh, atlas, CAMERA, FORWARD)
+    seen = render.picture(mesh, atlas, CAMERA, FORWARD)
     np.testing.assert_array_equal(image[..., 3] == 255, seen.covered)
     np.testing.assert_array_equal(np.isnan(z), ~seen.covered)
     np.testing.assert_allclose(image[..., 2::-1][seen.covered], seen.values[seen.covered], atol=0.51)
     assert (image[~seen.covered] == 0).all()
     np.testing.assert_allclose(z[30, 40], 1.8, atol=1e-3)
+
+
+def test_a_pixel_of_a_picture_shows_its_whole_area() -> None:
+    mesh, atlas = square_room()
+    rng = np.random.default_rng(2)
+    noisy = tuple(rng.integers(0, 256, page.shape, dtype=np.uint8) for page in atlas.pages)
+    fine = Atlas(noisy, atlas.page, atlas.uv, atlas.padding)
+    small = CameraModel(20, 15, 11.25, 11.0, 9.3, 7.175)  # CAMERA with pixels of four times its pixels' edge
+    seen = render.picture(mesh, fine, small, FORWARD)
+    point = render.render_coloured(mesh, fine, small, FORWARD)
+    np.testing.assert_array_equal(seen.covered, point.covered)
+    np.testing.assert_array_equal(seen.depth, point.depth)
+    dense = render.render_coloured(mesh, fine, CAMERA, FORWARD)
+    whole = dense.covered.reshape(15, 4, 20, 4).all(axis=(1, 3)) & seen.covered
+    mean = dense.values.reshape(15, 4, 20, 4, 3).mean(axis=(1, 3))
+    error, before = (np.abs(view.values - mean)[whole].mean() for view in (seen, point))
+    assert whole.sum() > 100 and error < 0.6 * before
+
+
+def test_render_darkens_as_the_lens_of_the_map_does(room: Path) -> None:
+    out, lens = room / "view.png", np.array([-0.5, 0.1, 0.0])
+    arguments = ["render", str(room), "--pose", POSE, "--out", str(out), "--intrinsics"]
+    intrinsics = "80 60 45 44 38.7 30.2"
+    assert main([*arguments, intrinsics]) == 0
+    before = cv2.imread(str(out), cv2.IMREAD_UNCHANGED)
+    other = replace(CAMERA, fx=60.0)
+    assert write_lenses(room / "map", {}) == 0
+    write_lenses(room / "map", {"far": (other, 3 * lens), "cam": (CAMERA, lens)})
+    assert main([*arguments, intrinsics]) == 0
+    after = cv2.imread(str(out), cv2.IMREAD_UNCHANGED)
+    expected = np.rint(before[..., :3] * falloff(CAMERA, lens.tolist())[..., None])
+    np.testing.assert_allclose(after[..., :3], expected, atol=1.0)
+    assert after[30, 5, 0] < 0.9 * before[30, 5, 0]
+    assert main([*arguments[:-1], "--no-falloff", "--intrinsics", intrinsics]) == 0
+    np.testing.assert_array_equal(cv2.imread(str(out), cv2.IMREAD_UNCHANGED), before)
+    assert known_falloff(room / "map", replace(CAMERA, fx=50.0)) == ()
+    assert known_falloff(None, CAMERA) == ()
+    (room / "map" / "lenses.json").write_text("[]")
+    with pytest.raises(InputError, match="damaged"):
+        known_falloff(room / "map", CAMERA)
 
 
 @pytest.mark.parametrize(("text", "expected"), [("front wall", {0, 1}), ("FLOOR", {8, 9})])

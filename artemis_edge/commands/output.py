@@ -22,6 +22,10 @@ def add_render(commands: Any) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
     parser.add_argument("--highlight", metavar="TEXT", help="tint the objects or the class of this name")
     parser.add_argument("--depth", type=Path, metavar="FILE.npy", help="metres along z, NaN where nothing")
+    parser.add_argument(
+        "--falloff", action=argparse.BooleanOptionalAction, default=True,
+        help="darken the corners as the lens of the map's camera with these intrinsics does (default)",
+    )  # fmt: skip
 
 
 def add_export(commands: Any) -> None:
@@ -47,7 +51,14 @@ def run_render(given: argparse.Namespace) -> int:
     from artemis_edge import render
 
     render.run(
-        given.map, given.pose, given.intrinsics, given.distortion, given.out, given.depth, given.highlight
+        given.map,
+        given.pose,
+        given.intrinsics,
+        given.distortion,
+        given.out,
+        given.depth,
+        given.highlight,
+        given.falloff,
     )
     return DONE
 

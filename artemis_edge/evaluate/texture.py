@@ -1,16 +1,14 @@
 """A map's texture against photographs that were kept out of it (``reprocess --holdout N``).
 
-The map is rendered at each photograph's pose and through its lens. Beside it stands the baseline: the input
-points, coloured by the mean of the images that see them, drawn as splats (``colouring.py``).
-
-The map holds colours without the fall-off of the lenses, photographs have it. So where PHOTOS.json states the
-fall-off of a photograph's lens, the picture is also compared as that camera would have taken it: darkened by the
-fall-off, and clipped where the camera clips.
+The map is rendered at each photograph's pose as its camera would take it (``render.picture``): through its lens with
+distortion and fall-off, clipped where a camera clips. The fall-off is the one that the mapping found, as it stands in
+PHOTOS.json or in the map; where it is known, the measures without it stand beside. Beside them stands the baseline:
+the input points, coloured by the mean of the images that see them, drawn as splats (``colouring.py``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +20,11 @@ from artemis_edge.evaluate.photos import Photo, count_photos, read_photos
 from artemis_edge.export.atlas import Atlas
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F32, Bool
+from artemis_edge.known_lenses import known_falloff
 from artemis_edge.lens import falloff
 from artemis_edge.opened_map import map_folder, open_map
 from artemis_edge.progress import Report, silent
-from artemis_edge.render import render_coloured
+from artemis_edge.render import picture
 
 _CLIPPED = 255.0  # as much as a photograph can hold
 
@@ -74,10 +73,10 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """The map's picture, and the same with the fall-off of the photographs' lenses (None: no lens's is known)."""
+    """The map's picture as the camera takes it, and without the lens's fall-off (None: no lens's is known)."""
 
-    plain: Series
-    with_falloff: Series | None
+    taken: Series
+    bare: Series | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,34 +89,34 @@ class TextureEvaluation:
     points_in_common: Series | None
 
     def to_json(self) -> dict[str, Any]:
-        """The JSON object of ``evaluate texture``; ``with_falloff`` is there where a lens's is known."""
-        lens = self.mesh.with_falloff
-        through = {} if lens is None else {"with_falloff": lens.to_json()}
-        return {**self.mesh.plain.to_json(), **through, "points_baseline": self._baseline()}
+        """The JSON object of ``evaluate texture``; ``without_falloff`` is there where a lens's is known."""
+        bare = self.mesh.bare
+        beside = {} if bare is None else {"without_falloff": bare.to_json()}
+        return {**self.mesh.taken.to_json(), **beside, "points_baseline": self._baseline()}
 
     def _baseline(self) -> dict[str, Any] | None:
         if self.points is None or self.mesh_in_common is None or self.points_in_common is None:
             return None
-        common = {"mesh": self.mesh_in_common.plain.means(), "points": self.points_in_common.means()}
-        lens = self.mesh_in_common.with_falloff
-        if lens is not None:
-            common["mesh_with_falloff"] = lens.means()
+        common = {"mesh": self.mesh_in_common.taken.means(), "points": self.points_in_common.means()}
+        bare = self.mesh_in_common.bare
+        if bare is not None:
+            common["mesh_without_falloff"] = bare.means()
         return {**self.points.to_json(), "common": common}
 
 
-def compare(file: str, photo: Photo, picture: F32, covered: Bool, brightest: float = np.inf) -> Likeness:
-    """``picture`` float32 (h, w, 3) 0..255 beside the photograph, over the pixels ``covered`` (h, w).
+def compare(file: str, photo: Photo, shown: F32, covered: Bool) -> Likeness:
+    """``shown`` float32 (h, w, 3) 0..255 beside the photograph, over the pixels ``covered`` (h, w).
 
-    After the gains nothing is brighter than ``brightest``.
+    After the gains nothing is brighter than a photograph can be.
     """
     share = float(covered.mean())
     if share == 0.0:
         return Likeness(file, None, None, None, 0.0)
-    levelled = picture * channel_gains(photo.image, picture, covered).astype(np.float32)
-    levelled = np.minimum(levelled, np.float32(brightest))
+    levelled = shown * channel_gains(photo.image, shown, covered).astype(np.float32)
+    levelled = np.minimum(levelled, np.float32(_CLIPPED))
     return Likeness(
         file,
-        psnr_db(photo.image, picture, covered),
+        psnr_db(photo.image, shown, covered),
         psnr_db(photo.image, levelled, covered),
         ssim(photo.image, levelled, covered),
         share,
@@ -125,19 +124,29 @@ def compare(file: str, photo: Photo, picture: F32, covered: Bool, brightest: flo
 
 
 def evaluate_texture(
-    mesh: Mesh, atlas: Atlas | None, splats: SplatCloud | None, photos: Path, report: Report = silent
+    mesh: Mesh,
+    atlas: Atlas | None,
+    splats: SplatCloud | None,
+    photos: Path,
+    report: Report = silent,
+    folder: Path | None = None,
 ) -> TextureEvaluation:
-    """Compare a map with the photographs of PHOTOS.json; raises InputError for photographs of no use."""
+    """Compare a map, whose folder ``map/`` is ``folder``, with the photographs of PHOTOS.json.
+
+    Raises InputError for photographs of no use.
+    """
     total = count_photos(photos)
     rows: list[tuple[Likeness | None, ...]] = []
     for done, photo in enumerate(read_photos(photos)):
+        if not photo.falloff:
+            photo = replace(photo, falloff=known_falloff(folder, photo.camera))
         rows.append(_one(mesh, atlas, splats, photo))
         report(done + 1, total, photo.file)
     series = [_series(column) for column in zip(*rows, strict=True)]
-    whole, lens, points, both, lens_both, points_both = series
+    whole, bare, points, both, bare_both, points_both = series
     assert whole is not None
-    in_common = None if both is None else Compared(both, lens_both)
-    return TextureEvaluation(Compared(whole, lens), points, in_common, points_both)
+    in_common = None if both is None else Compared(both, bare_both)
+    return TextureEvaluation(Compared(whole, bare), points, in_common, points_both)
 
 
 def _series(column: tuple[Likeness | None, ...]) -> Series | None:
@@ -148,23 +157,23 @@ def _series(column: tuple[Likeness | None, ...]) -> Series | None:
 def _one(
     mesh: Mesh, atlas: Atlas | None, splats: SplatCloud | None, photo: Photo
 ) -> tuple[Likeness | None, ...]:
-    """The map whole, with the fall-off, the points; the same map, with the fall-off, and points in common."""
-    seen = render_coloured(mesh, atlas, photo.camera, photo.T_world_cam)
+    """The map whole, without the fall-off, the points; the same map, without the fall-off, and points in common."""
+    seen = picture(mesh, atlas, photo.camera, photo.T_world_cam)
     whole = _mesh(photo, seen.values, seen.covered)
     if splats is None:
         return *whole, None, None, None, None
-    picture, drawn = splats.draw(photo.camera, photo.T_world_cam)
-    both = seen.covered & drawn
-    points = compare(photo.file, photo, picture, drawn)
-    return *whole, points, *_mesh(photo, seen.values, both), compare(photo.file, photo, picture, both)
+    drawn, shown = splats.draw(photo.camera, photo.T_world_cam)
+    both = seen.covered & shown
+    points = compare(photo.file, photo, drawn, shown)
+    return *whole, points, *_mesh(photo, seen.values, both), compare(photo.file, photo, drawn, both)
 
 
-def _mesh(photo: Photo, picture: F32, covered: Bool) -> tuple[Likeness, Likeness | None]:
-    plain = compare(photo.file, photo, picture, covered)
+def _mesh(photo: Photo, bare: F32, covered: Bool) -> tuple[Likeness, Likeness | None]:
+    plain = compare(photo.file, photo, bare, covered)
     if not photo.falloff:
         return plain, None
-    taken = picture * falloff(photo.camera, photo.falloff)[..., None]
-    return plain, compare(photo.file, photo, taken, covered, brightest=_CLIPPED)
+    taken = bare * falloff(photo.camera, photo.falloff)[..., None]
+    return compare(photo.file, photo, taken, covered), plain
 
 
 def run(map_path: Path, photos: Path, report: Report = silent) -> TextureEvaluation:
@@ -173,12 +182,12 @@ def run(map_path: Path, photos: Path, report: Report = silent) -> TextureEvaluat
     mesh, atlas = open_map(map_path)
     folder = map_folder(map_path)
     splats = None if folder is None else open_splats(folder, report)
-    return evaluate_texture(mesh, atlas, splats, photos, report)
+    return evaluate_texture(mesh, atlas, splats, photos, report, folder)
 
 
 def to_text(evaluation: TextureEvaluation) -> str:
     """The figures for people."""
-    lines = [f"{len(evaluation.mesh.plain.photos)} photographs", *_mesh_lines(evaluation.mesh)]
+    lines = [f"{len(evaluation.mesh.taken.photos)} photographs", *_mesh_lines(evaluation.mesh)]
     if evaluation.points is None:
         lines.append("no baseline: the map keeps no coloured points")
     else:
@@ -191,12 +200,8 @@ def to_text(evaluation: TextureEvaluation) -> str:
 
 
 def _mesh_lines(mesh: Compared) -> list[str]:
-    lines = [_line("map", mesh.plain)]
-    return (
-        lines
-        if mesh.with_falloff is None
-        else [*lines, _line("map, with the lens's fall-off", mesh.with_falloff)]
-    )
+    lines = [_line("map", mesh.taken)]
+    return lines if mesh.bare is None else [*lines, _line("map, without the lens's fall-off", mesh.bare)]
 
 
 def _line(name: str, series: Series) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from artemis_edge.config import RefinementConfig
 from artemis_edge.export.atlas import Atlas
 from artemis_edge.export.mesh import Mesh
-from artemis_edge.frames import F32, F64, CameraImage, TrackedFrame
+from artemis_edge.frames import F32, F64, CameraImage, CameraModel, TrackedFrame
 from artemis_edge.lens import log_falloff
 from artemis_edge.refinement import texels as tx
 from artemis_edge.refinement.atlas_builder import build_atlas
@@ -74,6 +74,7 @@ class Refinement:
         self._in_view = _FIRST_IN_VIEW
         self._exposures = Exposures(config.vignetting)
         self._falloff: dict[str, F64] = {}
+        self._models: dict[str, CameraModel] = {}
         self._shades: dict[str, F32] = {}
 
     def update(self, frame: TrackedFrame, stamp: int) -> None:
@@ -127,6 +128,11 @@ class Refinement:
         """Of each camera whose lens's fall-off was found, its coefficients (``lens.log_falloff``)."""
         return self._falloff
 
+    @property
+    def lenses(self) -> Mapping[str, tuple[CameraModel, F64]]:
+        """Those cameras with their models."""
+        return {name: (self._models[name], a) for name, a in self._falloff.items() if name in self._models}
+
     def _is_due(self, waiting: Waiting, stamp: int) -> bool:
         age = stamp - waiting.stamp
         if age >= self._config.patience_frames:
@@ -171,7 +177,7 @@ class Refinement:
         if pixels is None:
             return
         self._looks += 1
-        model = waiting.image.model
+        model = self._models[waiting.image.name] = waiting.image.model
         clear = sharpness(waiting.image, waiting.twist)
         learn = learn and self._config.vignetting and len(self._exposures) < _LEARNT[-1]
         # what is learnt must be of the same vertices from image to image
