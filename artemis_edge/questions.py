@@ -14,6 +14,7 @@ from artemis_edge.frames import F32, CameraImage
 from artemis_edge.highlight import Reply, answer, objects_of
 from artemis_edge.segmentation.backend import DenseScores, Grid, Prompt, Status
 from artemis_edge.segmentation.engine import HereEngine, ProcessEngine
+from artemis_edge.segmentation.query import each_once
 from artemis_edge.segmentation.registry import Registry, open_by_name
 from artemis_edge.segmentation.resolve import SlotTable, Understanding, understand
 from artemis_edge.segmentation.worker import Schedule, Scheduled
@@ -36,7 +37,7 @@ class Questions:
         """Understand questions with a model of the registry; raises InputError where it cannot be used or the
         questions need more classes than there are slots."""
         backend = Registry().find(model).open()
-        asked = tuple(understand(text, backend) for text in texts)
+        asked = tuple(understand(text, backend) for text in each_once(texts))
         slots = SlotTable()
         for question in asked:
             slots.acquire(question.classes)

@@ -20,6 +20,7 @@ from artemis_edge.paging import PageFile, pack
 from artemis_edge.segmentation import attribute
 from artemis_edge.segmentation.backend import DenseScores, Grid, Prompt, Segmentation, Status, Support
 from artemis_edge.segmentation.manifest import Manifest
+from artemis_edge.segmentation.query import each_once, tidied
 from artemis_edge.semantic_map import SemanticMap
 from artemis_edge.service.answers import MapAnswers
 from artemis_edge.service.questions import LONGEST, MOST_QUESTIONS, Desk
@@ -234,6 +235,18 @@ def test_questions_take_slots_and_give_them_back() -> None:
 def test_what_is_no_question_is_refused_with_a_sentence(text: object) -> None:
     with pytest.raises(InputError, match=r"write what to look for|at most 500|half a character"):
         Desk(MODEL).ask(text)
+
+
+def test_a_question_is_the_same_whatever_its_case_and_invisible_characters() -> None:
+    desk = Desk(MODEL)
+    desk.ask("Red\x1b \tCar\x00")
+    assert desk.asked().texts == ("Red Car",)
+    assert desk.ask("\u202ered  car\u202c").text == "Red Car"
+    assert desk.asked().texts == ("Red Car",)
+    desk.forget("RED CAR\n")
+    assert desk.asked().texts == ()
+    assert each_once(["car", "Car\r", " bench", ""]) == ("car", "bench", "")
+    assert tidied("\U0001f469\u200d\U0001f680") == "\U0001f469\u200d\U0001f680"
 
 
 def test_there_is_an_end_to_questions() -> None:

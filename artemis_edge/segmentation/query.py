@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import tomllib
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
@@ -22,6 +22,8 @@ _MOST_WORDS = 40
 _PUNCTUATION = ",;&"
 _IN_WORDS = "-'"
 _APOSTROPHE = "\u2019"
+# They change the direction of what follows, or take no place (Unicode 15, section 23.2); joiners stay: emoji need them
+_STEERING = frozenset("\u200b\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2060\u2066\u2067\u2068\u2069\ufeff")
 _LENGTH = re.compile(r"([0-9])(c?m)\b")  # "3m" is two words
 _NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,3})?")
 _BETWEEN = "between"
@@ -140,6 +142,25 @@ def parse(text: str) -> Query:
     if not named:
         return Query(text, (), "the question names no object; ask for example for 'red car'")
     return Query(text, named)
+
+
+def tidied(text: str) -> str:
+    """A question as it is kept: single spaces, none of the characters that steer a terminal or the way of writing."""
+    kept = (c for c in text if c.isspace() or not (unicodedata.category(c) == "Cc" or c in _STEERING))
+    return " ".join("".join(kept).split())
+
+
+def same_key(text: str) -> str:
+    """What is equal for two spellings of one question: case, spaces and invisible characters do not matter."""
+    return unicodedata.normalize("NFKC", tidied(text)).casefold()
+
+
+def each_once(texts: Iterable[str]) -> tuple[str, ...]:
+    """Questions tidied, each once, in its first spelling."""
+    first: dict[str, str] = {}
+    for text in texts:
+        first.setdefault(same_key(text), tidied(text))
+    return tuple(first.values())
 
 
 def shown(text: str) -> str:

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from artemis_edge.errors import InputError
 from artemis_edge.segmentation.knowledge import Knowledge
 from artemis_edge.segmentation.manifest import Manifest
-from artemis_edge.segmentation.query import Phrase
+from artemis_edge.segmentation.query import Phrase, same_key, tidied
 from artemis_edge.segmentation.resolve import SlotTable, Understanding, understand
 from artemis_edge.session.asked import Asked
 from artemis_edge.status import Colour, QueryStatus, next_colour
@@ -39,14 +39,15 @@ class Desk:
 
         Raises InputError for what is no question, and where slots are missing.
         """
-        if not isinstance(text, str) or not text.strip():
+        text = tidied(text) if isinstance(text, str) else ""
+        if not text:
             raise InputError("write what to look for, for example 'bench' or 'red car'")
-        text = " ".join(text.split())
         # JSON can say half a character, UTF-8 and the recording cannot
         if any(0xD800 <= ord(letter) < 0xE000 for letter in text):
             raise InputError("this question holds half a character (a lone surrogate); send it as UTF-8")
         if len(text) > LONGEST:
             raise InputError(f"a question has at most {LONGEST} characters; this one has {len(text)}")
+        text = self._first_spelling(text)
         if text not in self._asked:
             if len(self._asked) >= MOST_QUESTIONS:
                 raise InputError(f"{MOST_QUESTIONS} questions are asked already; remove one")
@@ -58,7 +59,7 @@ class Desk:
 
     def forget(self, text: object) -> None:
         """Ask it no more. Raises InputError where it is not asked."""
-        text = " ".join(text.split()) if isinstance(text, str) else ""
+        text = self._first_spelling(tidied(text)) if isinstance(text, str) else ""
         if text not in self._asked:
             known = ", ".join(f"'{other}'" for other in self._asked) or "none"
             raise InputError(f"'{text[:60]}' is not among the questions asked ({known})")
@@ -77,6 +78,11 @@ class Desk:
         done, total = segmentation.get("looking_back", (0, 0))
         note = f"looking back: {done} of {total}" if total else ""
         return [self._status(text, answers.get(text, {}), note) for text in self._asked]
+
+    def _first_spelling(self, text: str) -> str:
+        """The question asked already that is the same, else the text itself."""
+        key = same_key(text)
+        return next((other for other in self._asked if same_key(other) == key), text)
 
     def _status(self, text: str, answer: dict[str, Any], note: str = "") -> QueryStatus:
         question = self._asked[text]
