@@ -65,7 +65,7 @@ def _measure(request: Request, plain: bool, make: MakeMapper) -> dict[str, Any]:
         mapper = make(request.config, tracker, request.out)
         run = MappingRun(mapper, source, span, statistics)
         run.frames(report, interrupt, lambda frame: frame)
-        run.flush()
+        run.flush(report, interrupt)
     if run.stopped is not None or not statistics.frame_ms:
         raise RunError(f"{run.stopped or run.fault or 'no frame was mapped'}; nothing was measured")
     statistics.peak_rss_mb = health.peak_resident_mb() or None

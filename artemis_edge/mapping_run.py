@@ -21,7 +21,7 @@ from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F32, F64, FrameSource, MeshDelta, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.load import Load
 from artemis_edge.paging import Page
-from artemis_edge.progress import Report, say
+from artemis_edge.progress import Report, now_and_then, say
 from artemis_edge.refinement.photographs import Waiting
 from artemis_edge.session.statistics import RunStatistics
 
@@ -30,6 +30,7 @@ Publish = Callable[[MeshDelta], None]
 _NS_PER_MS = 1e6
 # Cycles are collected between frames, not inside one; what the warm-up left is frozen and costs nothing.
 _COLLECT_EVERY = 100
+_TELL_EVERY_S = 5.0
 
 
 class Mapper(Protocol):
@@ -67,8 +68,8 @@ class Mapper(Protocol):
         """Of each vertex of the written mesh, that of its class; empty without classes."""
         ...
 
-    def finish(self) -> MeshDelta | None:
-        """Work that was postponed."""
+    def finish(self, go_on: Callable[[int, int], bool] = ...) -> MeshDelta | None:
+        """Work that was postponed; ``go_on`` is told of photographs asked again, of how many, and may end that."""
         ...
 
     def ask(self, slots: Mapping[int, str]) -> None:
@@ -156,12 +157,22 @@ class MappingRun:
                 if done % _COLLECT_EVERY == _COLLECT_EVERY - 1:
                     gc.collect()
 
-    def flush(self) -> None:
-        """The work that was postponed, counted apart."""
+    def flush(self, report: Report, interrupt: Interrupt) -> None:
+        """The work that was postponed, counted apart; less of it for a user who wants an end."""
+
+        def told(done: int, total: int, note: str = "") -> None:
+            report(len(self._span), len(self._span), f"photographs asked again: {done} of {total}")
+
+        seldom = now_and_then(told, _TELL_EVERY_S)
+
+        def go_on(done: int, total: int) -> bool:
+            seldom(done, total)
+            return not interrupt.asked
+
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
         delta = None
         try:
-            delta = self._mapper.finish()
+            delta = self._mapper.finish(go_on)
         except (RunError, OSError) as error:
             self._stop(_sentence(error))
         self._statistics.flush_ms = (time.perf_counter_ns() - wall) / _NS_PER_MS

@@ -22,7 +22,7 @@ from artemis_edge.map_writer import save_map, write_mesh, write_removed
 from artemis_edge.mesher import Mesher
 from artemis_edge.paging import TIGHT, Page, Pager, with_attributes
 from artemis_edge.refinement.photographs import Waiting
-from artemis_edge.refinement.stage import Refinement
+from artemis_edge.refinement.stage import GoOn, Refinement, always
 from artemis_edge.semantic_constraint import SemanticConstraint
 from artemis_edge.semantic_map import Segmenter, SemanticMap
 from artemis_edge.visibility import FreeSpace
@@ -112,8 +112,8 @@ class Pipeline:
         """A viewer is new: all blocks in memory are told again, as the coming frames have room."""
         self.voxel_map.store.block[self.pager.resident(), CHANGED] = 1
 
-    def finish(self) -> MeshDelta:
-        """Everything postponed; the delta holds all that was not told yet."""
+    def finish(self, go_on: GoOn = always) -> MeshDelta:
+        """Everything postponed; the delta holds all that was not told yet. ``go_on``: see ``Refinement.finish``."""
         self.stage_ms = {}
         self._colour()
         self._fuse_masks(last=True)
@@ -125,7 +125,7 @@ class Pipeline:
                 self.constraint.unsettle(self._stamp)
             self.mesher.flush(self._stamp)
         with self._stage("refinement"):
-            self.refinement.finish()
+            self.refinement.finish(go_on)
         with self._stage("delta"):
             return self.outbox.everything(self._stamp)
 

@@ -141,7 +141,7 @@ def reprocess(
                 raise _nothing_mapped(run, source, span)
             stage = partial(report, len(span), len(span))
             stage("settling what was put off")
-            run.flush()
+            run.flush(report, interrupt)
         count_losses(statistics, source, tracker, mapper)
         results = Results(request.out)
         outcome = write_results(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,9 @@ from artemis_edge.frames import F32, F64, U8, CameraImage, CameraModel, TrackedF
 from artemis_edge.lens import undistorted_lines
 from artemis_edge.map_writer import gather_mesh
 from artemis_edge.refinement import texels as tx
+from artemis_edge.refinement.painting import new_brush, paint
 from artemis_edge.refinement.photographs import Alternate, Waiting
+from artemis_edge.refinement.reliability import PARTS
 from artemis_edge.refinement.stage import Refinement
 from tests import naive
 
@@ -289,6 +292,38 @@ def test_late_surface_is_coloured_from_keyframes(tmp_path: Path) -> None:
     places, colours = sample(mesh, atlas, np.array((1 / 3, 1 / 3, 1 / 3), np.float32))
     late = places[:, 1] > 1.4
     assert late.sum() > 20 and error(places[late], colours[late]) < 4.0
+
+
+def test_who_wants_an_end_is_told_what_was_left_out(scene: Scene) -> None:
+    scene.look((camera_image(photograph(pose())), pose()))
+    asked: list[tuple[int, int]] = []
+
+    def go_on(done: int, total: int) -> bool:
+        asked.append((done, total))
+        return False
+
+    scene.refinement.finish(go_on)
+    assert asked == [(0, 1)] and scene.refinement.lost == {"keyframes_not_asked_again": 1}
+
+
+@pytest.mark.parametrize(("enough", "kept"), [(4.0 * tx.INFORMATION_SCALE, True), (math.inf, False)])
+def test_at_the_end_a_view_from_afar_leaves_alone_what_was_seen_from_nearby(
+    scene: Scene, enough: float, kept: bool
+) -> None:
+    near, far = pose(x=WALL_X - 0.6), pose()
+    for _ in range(3):
+        scene.look((camera_image(photograph(near)), near))
+    refinement, texels = scene.refinement, scene.refinement.texels
+    before = texels.texel.copy()
+    view = refinement.viewer.look(photograph(far), MODEL, far)
+    photo = refinement.viewer.weigh(view, None, None).photo
+    brush = new_brush(scene.mapper.voxel_map.config.voxel_m, CALM.texel_px, CALM.finest_texel_m)
+    painted = paint(
+        texels, view.visible, scene.mapper.store.vertex, photo, refinement.trust, brush, 99, PARTS, enough
+    )
+    known = before[:, 3] > 0
+    assert known.sum() > 1000 and painted > 1000, "it sees more of the wall"
+    assert np.array_equal(texels.texel[known], before[known]) == kept
 
 
 def test_without_images_there_is_no_texture(scene: Scene) -> None:

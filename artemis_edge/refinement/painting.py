@@ -112,12 +112,13 @@ def paint(
     brush: Brush,
     stamp: int,
     share: int,
-    enough: int,
+    enough: float,
 ) -> int:
     """Update the texels of the listed triangles with what ``photo`` shows; returns how many were updated.
 
     ``share`` of ``PARTS`` parts of the voxels take part, others in other frames. Texels that hold at least ``enough``
-    information (as stored) are left as they are.
+    times the information (as stored) that a look like this one tells at best are left as they are; where a closer
+    look has been taken, so are all that anything is known of.
     """
     updated = 0
     for t in range(visible.length[2]):
@@ -193,7 +194,7 @@ def _paint_triangle(
     trust: Trust,
     brush: Brush,
     stamp: int,
-    enough: int,
+    enough: float,
 ) -> int:
     i, j, k = visible.triangle[t, 0], visible.triangle[t, 1], visible.triangle[t, 2]
     P = brush.plane
@@ -203,7 +204,7 @@ def _paint_triangle(
     if direction < 0:
         return 0
     depth_m = (np.float64(visible.point[i, 2]) + visible.point[j, 2] + visible.point[k, 2]) / 3.0
-    footprint_m = depth_m / photo.camera.fx
+    footprint_m = depth_m / (photo.camera.fx * math.sqrt(cosine))
     level = wanted_level(footprint_m, brush)
     low_b, high_b = min(P[0, 0], P[1, 0], P[2, 0]), max(P[0, 0], P[1, 0], P[2, 0])
     low_c, high_c = min(P[0, 1], P[1, 1], P[2, 1]), max(P[0, 1], P[1, 1], P[2, 1])
@@ -229,9 +230,15 @@ def _paint_triangle(
                     photo,
                     trust,
                     brush,
-                    enough,
+                    _looks_wanted(enough, level, texels.chart[chart, LEVEL]),
                 )
     return updated
+
+
+@kernel
+def _looks_wanted(enough: float, level: int, finest: int) -> float:
+    """Looks after which a view that wants ``level`` leaves texels of level ``finest`` alone; 0: if any is there."""
+    return enough if level + 1 >= finest or enough == math.inf else 0.0
 
 
 @kernel
@@ -294,7 +301,7 @@ def _paint_chart(
     photo: Photo,
     trust: Trust,
     brush: Brush,
-    enough: int,
+    enough: float,
 ) -> int:
     """The texels of one triangle (``brush.plane``) in one chart."""
     P, E, camera, V = brush.plane, brush.edge, photo.camera, brush.voxel_m
@@ -331,13 +338,16 @@ def _paint_chart(
     last_i = min(edge - 1, math.floor(high_b * edge - 0.5 + WIDEN))
     # a view tells about a texel what its pixels resolve of it
     size = texel_m * camera.fx * cosine
+    middle = 0.5 * (edge - 1)
+    best = min(size / max(o_z + middle * (i_z + j_z), NEAR_M), 1.0)
+    known = max(enough * best * best, 1.0)
     updated = 0
     for j in range(first_j, last_j + 1):
         first, last = row_span(E, j, first_i, last_i)
         for i in range(first, last + 1):
             z = o_z + i * i_z + j * j_z
             texel = texels.texel[at + j * edge + i]
-            if z < NEAR_M or texel[3] >= enough:
+            if z < NEAR_M or texel[3] >= known:
                 continue
             near = 1.0 / z
             u, v = to_pixel(camera, (o_x + i * i_x + j * j_x) * near, (o_y + i * i_y + j * j_y) * near)

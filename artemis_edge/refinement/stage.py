@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from artemis_edge.voxel_map import VoxelMap
 
 # Of the voxels in view, that may still wait for their first patch when an image is used
 _UNMESHED = 0.1
-_EVERYTHING = 1 << 16  # more than any texel's information as stored
+_EVERYTHING = math.inf  # looks, after which a texel is left as it is
 _LEARNT = (4, 8, 16, 32)  # keyframes after which the lenses' fall-off is found
 # Texels that the first image is taken to see, many: it must not cost more than the others
 _FIRST_IN_VIEW = 1e6
@@ -47,6 +48,15 @@ def trust_of(config: RefinementConfig) -> Trust:
         config.forget,
         config.least_cosine,
     )
+
+
+# How many of how many keyframes have been asked again; whether to go on
+GoOn = Callable[[int, int], bool]
+
+
+def always(done: int, total: int) -> bool:
+    """Go on, and tell nobody."""
+    return True
 
 
 class Refinement:
@@ -87,9 +97,12 @@ class Refinement:
             self._fuse(waiting, _EVERYTHING, learn=self.keyframes.offer(waiting))
             most -= 1
 
-    def finish(self) -> None:
-        """Use all images that wait; then give what was meshed late its colour from the keyframes."""
-        unseen = int(_LITTLE * tx.INFORMATION_SCALE)
+    def finish(self, go_on: GoOn = always) -> None:
+        """Use all images that wait; then give what was meshed late its colour from the keyframes.
+
+        The latter takes a third of a second a keyframe: ``go_on`` is asked before each.
+        """
+        unseen = _LITTLE * tx.INFORMATION_SCALE
         before = len(self.keyframes)
         if self._looks == 0:  # a map without colours: all images decide together what its exposure is
             for waiting, gain in zip(self._waiting, self._settle_exposures(), strict=True):
@@ -99,6 +112,9 @@ class Refinement:
                 self._fuse(waiting, _EVERYTHING)
         self._waiting.clear()
         for k in range(before):
+            if not go_on(k, before):
+                self.refused.count["keyframes_not_asked_again"] = before - k
+                return
             self._fuse(self.keyframes.get(k), unseen)
 
     @property
@@ -172,7 +188,7 @@ class Refinement:
         if len(self._exposures) in _LEARNT:
             self._set_falloff(self._exposures.falloff())
 
-    def _fuse(self, waiting: Waiting, enough: int, gain: F32 | None = None, learn: bool = False) -> None:
+    def _fuse(self, waiting: Waiting, enough: float, gain: F32 | None = None, learn: bool = False) -> None:
         pixels = decode(waiting.image, self.refused)
         if pixels is None:
             return

@@ -62,6 +62,7 @@ class LiveMapper:
         self._stop_at: int | None = None
         self._checked = time.monotonic()
         self._said = 0.0
+        self._photographs_left = 0
 
     def run(self) -> None:
         """Until it is told to stop and has mapped everything until then."""
@@ -114,7 +115,12 @@ class LiveMapper:
     def save(self) -> dict[str, Any]:
         """The map and all results."""
         self._say("saving", force=True)
-        return self.mapping.save(Path(self.task.out))
+        return self.mapping.save(Path(self.task.out), self._saving)
+
+    def _saving(self, done: int, total: int) -> bool:
+        self._photographs_left = total - done
+        self._say("saving")
+        return True
 
     def _after_frame(self) -> None:
         if self.mapping.assembler.next_index % _COLLECT_EVERY == 0:
@@ -187,6 +193,7 @@ class LiveMapper:
             "behind_s": round(feed.behind_s(), 2),
             "load": self.mapping.load.level,
             "fault": self.mapping.fault,
+            "photographs_left": self._photographs_left,
             "degenerate": bool(tracked is not None and tracked.degenerate),
             "coaching": self._coaching(),
             "deaths": self.checkpoints.deaths,

@@ -48,7 +48,7 @@ class StatusView:
         phase: Phase = state["phase"]
         return Status(
             state=phase,
-            message=state["fault"] or session.get("fault", "") or _message(devices),
+            message=state["fault"] or session.get("fault", "") or _saving(mapping) or _message(devices),
             seconds=session.get("seconds", 0.0),
             session=session.get("folder", ""),
             frames=mapping.get("mapped", 0),
@@ -101,6 +101,11 @@ def expected_hz(config: RunConfig) -> dict[str, float]:
         if config.trigger is not None:
             found[camera.device.name] = config.trigger.rate_hz
     return found
+
+
+def _saving(mapping: dict[str, Any]) -> str:
+    left = mapping.get("photographs_left", 0)
+    return f"colouring: {left} photographs are asked again" if left else ""
 
 
 def _message(devices: Sequence[Health]) -> str:

@@ -25,6 +25,7 @@ from artemis_edge.load import Load
 from artemis_edge.loop.relocate import Found
 from artemis_edge.map_size import MapSize
 from artemis_edge.mapping_run import Mapper
+from artemis_edge.refinement.stage import GoOn, always
 from artemis_edge.runtime import MakeMapper, pipeline, with_tiny_map, write_results
 from artemis_edge.session import made_up_room
 from artemis_edge.session.asked import Asked
@@ -117,15 +118,18 @@ class StreamMapping:
             return
         self.mapper.reduce(self.load)
 
-    def save(self, out: Path) -> dict[str, Any]:
-        """Finish the map and write all results to ``out``; returns what report.json holds. Raises RunError."""
+    def save(self, out: Path, go_on: GoOn = always) -> dict[str, Any]:
+        """Finish the map and write all results to ``out``; returns what report.json holds. Raises RunError.
+
+        ``go_on`` is told of photographs that are asked again, of how many.
+        """
         prepare(out)
         for frame in self.odometry.release():
             self._one(frame)
         if not self.mapper.trajectory:
             raise RunError("no frame of a LiDAR could be mapped; what was recorded is kept")
         wall, cpu = time.perf_counter_ns(), time.process_time_ns()
-        self.mapper.finish()
+        self.mapper.finish(go_on)
         self.statistics.flush_ms = (time.perf_counter_ns() - wall) / _NS_PER_MS
         self.statistics.flush_cpu_ms = (time.process_time_ns() - cpu) / _NS_PER_MS
         self.statistics.add_lost(self.assembler.lost)

@@ -26,6 +26,7 @@ from artemis_edge.newest import Newest
 from artemis_edge.pipeline import Pipeline
 from artemis_edge.progress import Report
 from artemis_edge.questions import BlankMasks
+from artemis_edge.refinement.stage import GoOn, always
 from artemis_edge.semantic_map import Segmenter
 from artemis_edge.status import MapStatus, Status, Stream
 from artemis_edge.tui.live_questions import EVERY_CLASS, LiveQuestions
@@ -221,10 +222,15 @@ class WatchedPipeline(Pipeline):
         self._tell(frame)
         return delta
 
-    def finish(self) -> MeshDelta:
+    def finish(self, go_on: GoOn = always) -> MeshDelta:
         """The walk is over: what was postponed is done, and everything is saved."""
         self._teller.say(state="saving", message="the walk is over; the map is being saved and measured")
-        delta = super().finish()
+
+        def told(done: int, total: int) -> bool:
+            self._teller.say(message=f"the walk is over; photographs asked again: {done} of {total}")
+            return go_on(done, total)
+
+        delta = super().finish(told)
         self._teller.news(delta)
         return delta
 
