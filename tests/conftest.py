@@ -11,6 +11,7 @@ import pytest
 from artemis_edge.export.ply import Mesh, bare_mesh, write_ply
 from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
 from artemis_edge.load import Load
+from artemis_edge.refinement.stage import GoOn, always
 
 # In this order, before all others: what compiles kernels that many need, and beside it what needs none of them; then
 # files that take long, so that no worker waits for the other's last one; those at the LiDAR's ports apart.
@@ -65,7 +66,7 @@ class FakeMapper:
     def take_over(self, pages: Iterable[object], photographs: Iterable[object]) -> None:
         self.earlier = list(pages)
 
-    def finish(self) -> None:
+    def finish(self, go_on: GoOn = always) -> None:
         self.finished = True
 
     def ask(self, slots: Mapping[int, str]) -> None:
