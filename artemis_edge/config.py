@@ -373,6 +373,15 @@ class RefinementConfig(Struct, frozen=True, forbid_unknown_fields=True):
             le=100_000_000,
         ),
     ] = 60_000
+    most_triangles: Annotated[
+        int,
+        Meta(
+            description="Triangles that one image is compared with while the map grows, the nearest in view; each takes"
+            " about 100 ns.",
+            ge=1000,
+            le=100_000_000,
+        ),
+    ] = 120_000
     alternate: Annotated[
         bool,
         Meta(

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from artemis_edge._jit import kernel
-from artemis_edge.frames import F64, CameraModel
+from artemis_edge.frames import F32, F64, CameraModel
 from artemis_edge.lens import fold_radius, undistorted_lines
 
 _BORDER_STEP = 16  # pixels between the lines of sight that bound the view
+_MARGIN = 1.1  # on the lens's enlargement between them, and across the axes
 
 
 class Camera(NamedTuple):
@@ -36,9 +37,12 @@ class Camera(NamedTuple):
     right: float
     top: float
     bottom: float
+    stretch: float  # by how much the lens enlarges a small angle at most, against fx and fy
 
 
-def make_camera(model: CameraModel, T_world_cam: F64, bounds: tuple[float, float, float, float]) -> Camera:
+def make_camera(
+    model: CameraModel, T_world_cam: F64, bounds: tuple[float, float, float, float, float]
+) -> Camera:
     """Camera of a model at a pose (4, 4); ``bounds`` as :func:`view_bounds` gives them."""
     R = np.ascontiguousarray(T_world_cam[:3, :3].T)
     centre = np.ascontiguousarray(T_world_cam[:3, 3])
@@ -63,8 +67,8 @@ def make_camera(model: CameraModel, T_world_cam: F64, bounds: tuple[float, float
     )
 
 
-def view_bounds(model: CameraModel) -> tuple[float, float, float, float]:
-    """Least and greatest x / z and y / z that the image shows: left, right, top, bottom.
+def view_bounds(model: CameraModel) -> tuple[float, float, float, float, float]:
+    """Least and greatest x / z and y / z that the image shows: left, right, top, bottom; and ``Camera.stretch``.
 
     NaN where no pixel has a line of sight.
     """
@@ -80,9 +84,16 @@ def view_bounds(model: CameraModel) -> tuple[float, float, float, float]:
     )
     lines = undistorted_lines(coarse)
     if not np.isfinite(lines).any():
-        return (math.nan,) * 4
+        return (math.nan,) * 5
     low, high = np.nanmin(lines, axis=(0, 1)), np.nanmax(lines, axis=(0, 1))
-    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+    return float(low[0]), float(high[0]), float(low[1]), float(high[1]), _stretch(lines, model)
+
+
+def _stretch(lines: F32, model: CameraModel) -> float:
+    """Of the lines of sight of pixels ``_BORDER_STEP`` apart: pixels to angle at most, in focal lengths."""
+    apart = [np.abs(np.diff(lines[..., k], axis=1 - k)) * f for k, f in enumerate((model.fx, model.fy))]
+    least = min(float(np.nanmin(a, initial=np.inf)) for a in apart)
+    return max(_BORDER_STEP / max(least, 1e-3) * _MARGIN, 1.0)
 
 
 @kernel

@@ -121,7 +121,7 @@ def paint(
     look has been taken, so are all that anything is known of.
     """
     updated = 0
-    for t in range(visible.length[2]):
+    for t in range(visible.length[1]):
         if takes_no_part(visible.owner[t], share, stamp):
             continue
         if not _is_in_view(visible, t, photo.camera):
@@ -183,7 +183,8 @@ def load_triangle(
     return direction, -nb / na, -nc / na
 
 
-@kernel
+# In line: a call hands on some 300 numbers that the tuples of arrays consist of, which a texel's work is not worth
+@kernel(inline="always")
 def _paint_triangle(
     texels: TexelStore,
     visible: Visible,
@@ -288,7 +289,7 @@ def row_span(E: F64, j: float, first: int, last: int) -> tuple[int, int]:
     return first, last
 
 
-@kernel
+@kernel(inline="always")
 def _paint_chart(
     texels: TexelStore,
     chart: int,
@@ -362,7 +363,7 @@ def _paint_chart(
     return updated
 
 
-@kernel
+@kernel(inline="always")
 def _update(
     texel: NDArray[np.uint16], photo: Photo, u: float, v: float, g: float, quality: float, trust: Trust
 ) -> None:

@@ -91,6 +91,11 @@ def geometric(front: float, near: float, slope: float, sigma: float) -> float:
     return math.exp(-0.5 * (r / sigma) * (r / sigma))
 
 
+def clearly_behind(trust: Trust) -> float:
+    """How many times as near as a surface what is in front of it must be, for its W to be below ``trust.least``."""
+    return 1.0 + trust.sigma_geom * math.sqrt(-2.0 * math.log(trust.least))
+
+
 @kernel
 def photometric(r2: float, information: float, trust: Trust) -> float:
     """exp(-(r_photo / sigma)^2 / 2) of a squared colour difference (eq. 10, sum over the channels)."""
@@ -116,14 +121,15 @@ def reach_of(camera: Camera, depth: Depth, nx: float, ny: float, distance: float
 @kernel
 def front_at(depth: Depth, u: float, v: float) -> float:
     """What the depth map shows at a pixel of the image, which must lie inside."""
-    near: float = depth.front[int(v + 0.5) // depth.step, int(u + 0.5) // depth.step]
+    scale = 1.0 / depth.step
+    near: float = depth.front[np.uint32((v + 0.5) * scale), np.uint32((u + 0.5) * scale)]
     return near
 
 
 @kernel
 def sample(image: U8, u: float, v: float) -> tuple[float, float, float]:
     """Bilinear red, green, blue at a place with 0 <= u < width - 1, 0 <= v < height - 1."""
-    column, row = int(u), int(v)
+    column, row = np.uint32(u), np.uint32(v)
     a, b = u - column, v - row
     p, q, r, s = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
     return (
@@ -184,7 +190,7 @@ def observe(
     Of vertices that have a colour only ``share`` of ``PARTS`` take part, others with another ``stamp``.
     :func:`weigh` fills ``reliability``.
     """
-    out = new_observations(int(visible.length[1]))
+    out = new_observations(int(visible.length[0]))
     n = observe_vertices(store, visible, photo, trust, share, stamp, out)
     return Observations(
         out.slot[:n],
@@ -206,7 +212,7 @@ def observe_vertices(
     n, camera = 0, photo.camera
     coloured = store.attribute.shape[1] > INFORMATION
     right, bottom = camera.width - 1.0, camera.height - 1.0
-    for i in range(visible.length[1]):
+    for i in range(visible.length[0]):
         u, v, near = visible.pixel[i, 0], visible.pixel[i, 1], visible.pixel[i, 2]
         if not (0.0 <= u < right and 0.0 <= v < bottom):  # NaN is not
             continue

@@ -28,6 +28,7 @@ from artemis_edge.voxel_map import VoxelMap
 # Of the voxels in view, that may still wait for their first patch when an image is used
 _UNMESHED = 0.1
 _EVERYTHING = math.inf  # looks, after which a texel is left as it is
+_EVERY_TRIANGLE = 1 << 30
 _LEARNT = (4, 8, 16, 32)  # keyframes after which the lenses' fall-off is found
 # Texels that the first image is taken to see, many: it must not cost more than the others
 _FIRST_IN_VIEW = 1e6
@@ -198,7 +199,9 @@ class Refinement:
         learn = learn and self._config.vignetting and len(self._exposures) < _LEARNT[-1]
         # what is learnt must be of the same vertices from image to image
         some = None if gain is not None else 0 if learn else self._looks
-        view = self.viewer.look(pixels, model, waiting.T_world_cam, clear, some)
+        bounded = gain is None and enough == _EVERYTHING
+        most = self._config.most_triangles if bounded else _EVERY_TRIANGLE
+        view = self.viewer.look(pixels, model, waiting.T_world_cam, clear, some, most)
         if learn:
             self._learn(waiting, view)
         view = self.viewer.weigh(view, gain, self._shades.get(waiting.image.name))
@@ -209,7 +212,7 @@ class Refinement:
             else little_known(store, view.seen, _LITTLE / self.trust.noise2)
         )
         update_vertices(store, seen, model.fx * voxel_m / 4, view.photo.sharpness, self.trust)
-        part = PARTS if gain is not None or enough != _EVERYTHING else self._part()
+        part = self._part() if bounded else PARTS
         painted = paint(
             self.texels,
             view.visible,

@@ -12,11 +12,20 @@ from artemis_edge.lens import corner_radius2
 from artemis_edge.refinement.camera import Camera, make_camera, view_bounds
 from artemis_edge.refinement.colours import estimate_gain
 from artemis_edge.refinement.exposure import SHADES
-from artemis_edge.refinement.reliability import PARTS, Observations, Photo, Trust, observe, weigh
-from artemis_edge.refinement.visible import Visible, depth_map, list_visible, new_visible, unmeshed
+from artemis_edge.refinement.reliability import (
+    PARTS,
+    Observations,
+    Photo,
+    Trust,
+    clearly_behind,
+    observe,
+    weigh,
+)
+from artemis_edge.refinement.visible import Scope, Visible, list_visible, new_visible, unmeshed
 
 _ONES = np.ones(SHADES, np.float32)
 _ENOUGH = 8000  # vertices: many times what an image's exposure needs
+_ALL = 1 << 30
 _DEPTH_WIDTH = 320  # pixels of the reference depth map, about: finer ones lose nothing that matters
 
 
@@ -37,7 +46,7 @@ class Viewer:
     def __init__(self, store: Store, voxel_m: float, far_m: float, trust: Trust) -> None:
         self._store, self._voxel_m, self._far_m, self.trust = store, voxel_m, far_m, trust
         self._visible = new_visible(store)
-        self._bounds: dict[CameraModel, tuple[float, float, float, float]] = {}
+        self._bounds: dict[CameraModel, tuple[float, float, float, float, float]] = {}
 
     def unmeshed_share(self, model: CameraModel, T_world_cam: F64) -> float:
         """Share of the voxels in view that wait for their first patch; 1 where no voxel is in view."""
@@ -51,18 +60,21 @@ class Viewer:
         T_world_cam: F64,
         sharpness: float = 1.0,
         stamp: int | None = None,
+        most: int = _ALL,
     ) -> View:
         """View of ``image`` uint8 (h, w, 3) RGB taken at ``T_world_cam`` (4, 4) with the map as it is now.
 
         With a ``stamp`` about ``_ENOUGH`` of the vertices that have a colour are observed, others with another one.
+        Of more than ``most`` triangles the nearest are looked at.
         """
         camera = self._camera(model, T_world_cam)
-        self._visible = list_visible(self._store, camera, self._voxel_m, self._far_m, self._visible)
-        depth = depth_map(self._visible, camera, max(round(model.width / _DEPTH_WIDTH), 1))
+        step = max(round(model.width / _DEPTH_WIDTH), 1)
+        scope = Scope(self._voxel_m, self._far_m, step, clearly_behind(self.trust), most)
+        self._visible, depth = list_visible(self._store, camera, scope, self._visible)
         photo = Photo(camera, image, depth, _ONES[:3], _ONES, 1.0 / corner_radius2(model), sharpness)
         share = PARTS
         if stamp is not None:
-            share = max(min(PARTS * _ENOUGH // max(int(self._visible.length[1]), 1), PARTS), 1)
+            share = max(min(PARTS * _ENOUGH // max(int(self._visible.length[0]), 1), PARTS), 1)
         seen = observe(self._store, self._visible, photo, self.trust, share, stamp or 0)
         return View(self._visible, photo, seen)
 

@@ -29,17 +29,16 @@ from artemis_edge.paging import EAR_MASK
 from artemis_edge.refinement.camera import Camera, sees_sphere, to_camera, to_pixel
 
 NEAR_M = 0.2
-# Triangles larger than this many pixels of the depth map are drawn by clipped boxes all the same; a box this far
-# outside the picture belongs to a triangle that the lens model tears apart
-_ROOM = 1.2  # of the lists, when they must grow
+_GROWTH = 2  # of lists that are full
 # Half the diagonal of a cube in edges
 _HALF_DIAGONAL = 0.8661
+_VOXELS = 512  # of a block
 
 
 class Visible(NamedTuple):
     """Lists of one image. Vertices and triangles have room for more than ``length`` says."""
 
-    voxel: I32  # (v,) slots
+    voxel: I32  # (512,) slots of the block at hand
     slot: I32  # (n,) cell slots of living vertices
     point: F32  # (n, 3) in the camera's coordinates [m]
     pixel: F32  # (n, 3) u, v and nearness 1 / z; NaN where not in front of the camera
@@ -47,13 +46,15 @@ class Visible(NamedTuple):
     triangle: I32  # (m, 3) rows of vertices
     owner: I32  # (m,) voxel slot
     neighbour: I32  # (27,)
-    length: I32  # (3,) voxels, vertices, triangles
+    length: I32  # (2,) vertices, triangles
+    block: I32  # (blocks,) slots, and
+    away: F32  # (blocks,) how far they are from the camera [m]
 
 
-def new_visible(store: Store, voxels: int = 1024, vertices: int = 8192, triangles: int = 16384) -> Visible:
+def new_visible(store: Store, vertices: int = 65_536, triangles: int = 131_072) -> Visible:
     """Fresh scratch with room for so much in one view."""
     return Visible(
-        voxel=np.empty(voxels, np.int32),
+        voxel=np.empty(_VOXELS, np.int32),
         slot=np.empty(vertices, np.int32),
         point=np.empty((vertices, 3), np.float32),
         pixel=np.empty((vertices, 3), np.float32),
@@ -61,54 +62,137 @@ def new_visible(store: Store, voxels: int = 1024, vertices: int = 8192, triangle
         triangle=np.empty((triangles, 3), np.int32),
         owner=np.empty(triangles, np.int32),
         neighbour=np.empty(27, np.int32),
-        length=np.zeros(3, np.int32),
+        length=np.zeros(2, np.int32),
+        block=np.empty(len(store.block), np.int32),
+        away=np.empty(len(store.block), np.float32),
     )
 
 
-def list_visible(store: Store, camera: Camera, voxel_m: float, far_m: float, w: Visible) -> Visible:
-    """Voxels, vertices and triangles in the frustum; returns ``w``, or larger scratch if it had to grow."""
-    n = list_voxels(store, camera, voxel_m, far_m, w.voxel)
-    if n > len(w.voxel):
-        w = w._replace(voxel=np.empty(int(n * _ROOM), np.int32))
-        list_voxels(store, camera, voxel_m, far_m, w.voxel)
-    vertices, triangles = count_contents(store, w.voxel[:n])
-    if vertices > len(w.slot):
-        room = int(vertices * _ROOM)
+class Scope(NamedTuple):
+    """How far and how finely one looks: ``step`` image pixels are one of the depth map.
+
+    Left out is what lies so far behind that the nearness of what is in front of it is more than ``behind`` times its
+    own, and the blocks that are farther away than those that have ``most`` triangles.
+    """
+
+    voxel_m: float
+    far_m: float
+    step: int
+    behind: float
+    most: int
+
+
+def list_visible(store: Store, camera: Camera, scope: Scope, w: Visible) -> tuple[Visible, Depth]:
+    """Vertices and triangles in view, but for what is hidden clearly, and the reference depth map d_ref of eq. 11.
+
+    Returns ``w``, or larger scratch if it had to grow. From the nearest block to the farthest, so that what hides is
+    known before what is hidden. Corners are put where the lens puts them and edges are drawn straight: between
+    vertices 0.1 m apart a lens bends an edge by much less than a pixel of this map.
+    """
+    n = list_blocks(store, camera, scope, w)
+    blocks = w.block[:n][np.argsort(w.away[:n], kind="stable")]
+    while True:
+        nearness = np.zeros((-(-camera.height // scope.step), -(-camera.width // scope.step)), np.float32)
+        if see_blocks(store, camera, scope, blocks, w, nearness):
+            break
+        room = _GROWTH * len(w.slot)
         point, pixel = np.empty((2, room, 3), np.float32)
-        w = w._replace(slot=np.empty(room, np.int32), point=point, pixel=pixel)
-    if triangles > len(w.triangle):
-        room = int(triangles * _ROOM)
-        w = w._replace(triangle=np.empty((room, 3), np.int32), owner=np.empty(room, np.int32))
-    w.length[0] = n
-    w.length[1] = list_vertices(store, camera, n, w)
-    w.length[2] = list_triangles(store, n, w)
-    return w
+        triangles = _GROWTH * len(w.triangle)
+        w = w._replace(
+            slot=np.empty(room, np.int32),
+            point=point,
+            pixel=pixel,
+            triangle=np.empty((triangles, 3), np.int32),
+            owner=np.empty(triangles, np.int32),
+        )
+    front = cv2.dilate(nearness, np.ones((3, 3), np.uint8)).astype(np.float32, copy=False)
+    return w, Depth(nearness, front, scope.step)
 
 
 @kernel
-def list_voxels(store: Store, camera: Camera, voxel_m: float, far_m: float, out: I32) -> int:
-    """Slots of the voxels in view, as many as fit into ``out``; returns how many there are."""
-    n = 0
-    block_m = voxel_m * bs.VOXELS_PER_BLOCK
+def list_blocks(store: Store, camera: Camera, scope: Scope, w: Visible) -> int:
+    """Blocks in view and how far away they are, in the order of the hash; returns how many."""
+    n, block_m = 0, scope.voxel_m * bs.VOXELS_PER_BLOCK
+    radius = _HALF_DIAGONAL * block_m + scope.voxel_m
     for at in range(store.hash_key.shape[0]):
         if store.hash_key[at] == bs.EMPTY_KEY:
             continue
-        block = store.hash_slot[at]
+        row = store.block[store.hash_slot[at]]
+        x, y, z = (row[BX] + 0.5) * block_m, (row[BX + 1] + 0.5) * block_m, (row[BX + 2] + 0.5) * block_m
+        if sees_sphere(camera, x, y, z, radius, NEAR_M, scope.far_m):
+            a, b, c = to_camera(camera, x, y, z)
+            w.block[n], w.away[n] = store.hash_slot[at], math.sqrt(a * a + b * b + c * c)
+            n += 1
+    return n
+
+
+@kernel
+def see_blocks(store: Store, camera: Camera, scope: Scope, blocks: I32, w: Visible, nearness: F32) -> bool:
+    """List what ``blocks`` show, and draw their nearness; False when a list is full."""
+    w.length[:] = 0
+    block_m = scope.voxel_m * bs.VOXELS_PER_BLOCK
+    radius = _HALF_DIAGONAL * block_m + scope.voxel_m
+    for block in blocks:
         row = store.block[block]
         x, y, z = (row[BX] + 0.5) * block_m, (row[BX + 1] + 0.5) * block_m, (row[BX + 2] + 0.5) * block_m
-        if not sees_sphere(camera, x, y, z, _HALF_DIAGONAL * block_m + voxel_m, NEAR_M, far_m):
+        if w.length[1] >= scope.most:
+            break
+        if is_hidden(camera, scope, x, y, z, radius, nearness):
             continue
-        for inner in range(512):
-            v = store.block_voxel[block, inner]
-            if v < 0 or store.voxel_mask[v] == 0:
-                continue
-            own = store.voxel[v]
-            x, y, z = (own[IX] + 0.5) * voxel_m, (own[IY] + 0.5) * voxel_m, (own[IZ] + 0.5) * voxel_m
-            # a voxel's triangles reach into its neighbours, and theirs use its vertices
-            if sees_sphere(camera, x, y, z, (_HALF_DIAGONAL + 1.0) * voxel_m, NEAR_M, far_m):
-                if n < out.shape[0]:
-                    out[n] = v
-                n += 1
+        voxels = list_voxels(store, camera, scope, block, nearness, w.voxel)
+        for i in range(voxels):
+            if not list_vertices(store, camera, w.voxel[i], w):
+                return False
+        for i in range(voxels):
+            first = w.length[1]
+            if not list_triangles(store, camera, w.voxel[i], w):
+                return False
+            draw_nearness(w.pixel, w.triangle[first : w.length[1]], 1.0 / scope.step, nearness)
+    return True
+
+
+@kernel
+def is_hidden(
+    camera: Camera, scope: Scope, x: float, y: float, z: float, radius: float, nearness: F32
+) -> bool:
+    """Whether all that a sphere of the world can cover in the depth map is clearly behind what is drawn there."""
+    a, b, c = to_camera(camera, x, y, z)
+    if c - radius < NEAR_M:
+        return False
+    u, v = to_pixel(camera, a / c, b / c)
+    least = scope.behind / (c - radius)
+    scale = 1.0 / scope.step
+    # a / c changes by no more than radius / (c - radius) (1 + |a / c|) over the sphere
+    reach = camera.stretch * radius / (c - radius) * scale
+    wide, high = reach * camera.fx * (1.0 + abs(a / c)) + 1.0, reach * camera.fy * (1.0 + abs(b / c)) + 1.0
+    u, v = (u + 0.5) * scale, (v + 0.5) * scale
+    rows, columns = nearness.shape
+    if not (0.0 <= u < columns and 0.0 <= v < rows) or nearness[int(v), int(u)] <= least:
+        return False
+    for row in range(max(int(v - high), 0), min(int(v + high) + 1, rows)):
+        for column in range(max(int(u - wide), 0), min(int(u + wide) + 1, columns)):
+            if nearness[row, column] <= least:
+                return False
+    return True
+
+
+@kernel
+def list_voxels(store: Store, camera: Camera, scope: Scope, block: int, nearness: F32, out: I32) -> int:
+    """Slots of the voxels of a block that are in view and not hidden; returns how many."""
+    n, voxel_m = 0, scope.voxel_m
+    # a voxel's triangles reach into its neighbours, and theirs use its vertices
+    radius = (_HALF_DIAGONAL + 1.0) * voxel_m
+    for inner in range(_VOXELS):
+        v = store.block_voxel[block, inner]
+        if v < 0 or store.voxel_mask[v] == 0:
+            continue
+        own = store.voxel[v]
+        x, y, z = (own[IX] + 0.5) * voxel_m, (own[IY] + 0.5) * voxel_m, (own[IZ] + 0.5) * voxel_m
+        if sees_sphere(camera, x, y, z, radius, NEAR_M, scope.far_m) and not is_hidden(
+            camera, scope, x, y, z, radius, nearness
+        ):
+            out[n] = v
+            n += 1
     return n
 
 
@@ -134,79 +218,86 @@ def unmeshed(store: Store, camera: Camera, voxel_m: float, far_m: float) -> floa
 
 
 @kernel
-def count_contents(store: Store, voxels: I32) -> tuple[int, int]:
-    """Most vertices and triangles that voxels can have."""
-    vertices = triangles = 0
-    for v in voxels:
-        mask = store.voxel_mask[v]
-        while mask != 0:
-            mask &= mask - np.uint64(1)
-            vertices += 1
-        triangles += store.voxel[v, PATCH_LEN]
-    return vertices, triangles
+def row_of(w: Visible, s: int) -> int:
+    """Row of a vertex, -1 where it is not listed."""
+    row = w.place[s]
+    return int(row) if row < w.length[0] and w.slot[row] == s else -1
 
 
 @kernel
-def list_vertices(store: Store, camera: Camera, voxels: int, w: Visible) -> int:
-    """Living vertices of the listed voxels, projected."""
-    n = 0
-    for i in range(voxels):
-        v = w.voxel[i]
-        mask = store.voxel_mask[v]
-        while mask != 0:
-            s = store.voxel_cell[v, bs.lowest_bit(mask)]
-            mask &= mask - np.uint64(1)
-            if store.state[s] != ALIVE:
-                continue
-            p = store.vertex[s]
-            x, y, z = to_camera(camera, p[POSITION], p[POSITION + 1], p[POSITION + 2])
-            w.slot[n] = s
-            w.place[s] = n
-            w.point[n, 0], w.point[n, 1], w.point[n, 2] = x, y, z
-            if z > NEAR_M:
-                near = 1.0 / z
-                w.pixel[n, 0], w.pixel[n, 1] = to_pixel(camera, x * near, y * near)
-                w.pixel[n, 2] = near
-            else:
-                w.pixel[n, 0] = w.pixel[n, 1] = w.pixel[n, 2] = math.nan
-            n += 1
+def add_vertex(store: Store, camera: Camera, s: int, w: Visible) -> int:
+    """List a vertex that is not listed, projected; returns its row, -1 when the list is full."""
+    n = int(w.length[0])
+    if n == w.slot.shape[0]:
+        return -1
+    p = store.vertex[s]
+    x, y, z = to_camera(camera, p[POSITION], p[POSITION + 1], p[POSITION + 2])
+    w.slot[n] = s
+    w.place[s] = n
+    w.point[n, 0], w.point[n, 1], w.point[n, 2] = x, y, z
+    if z > NEAR_M:
+        near = 1.0 / z
+        w.pixel[n, 0], w.pixel[n, 1] = to_pixel(camera, x * near, y * near)
+        w.pixel[n, 2] = near
+    else:
+        w.pixel[n, 0] = w.pixel[n, 1] = w.pixel[n, 2] = math.nan
+    w.length[0] = n + 1
     return n
 
 
 @kernel
-def _row_of(store: Store, w: Visible, code: int, vertices: int) -> int:
-    """Row of the vertex that a triangle's code names, -1 where it is not listed."""
+def list_vertices(store: Store, camera: Camera, v: int, w: Visible) -> bool:
+    """List the living vertices of a voxel; False when the list is full."""
+    mask = store.voxel_mask[v]
+    while mask != 0:
+        s = store.voxel_cell[v, bs.lowest_bit(mask)]
+        mask &= mask - np.uint64(1)
+        if store.state[s] == ALIVE and row_of(w, s) < 0 and add_vertex(store, camera, s, w) < 0:
+            return False
+    return True
+
+
+@kernel
+def _living(store: Store, w: Visible, code: int) -> int:
+    """Cell slot of the vertex that a triangle's code names, -1 where it does not live."""
     u = w.neighbour[code_voxel(code)]
     if u < 0:
         return -1
     s = store.voxel_cell[u, code_cell(code)]
-    if s < 0:
-        return -1
-    row = w.place[s]
-    return row if row < vertices and w.slot[row] == s else -1
+    return int(s) if s >= 0 and store.state[s] == ALIVE else -1
 
 
 @kernel
-def list_triangles(store: Store, voxels: int, w: Visible) -> int:
-    """Triangles of the listed voxels all of whose vertices lie in front of the camera."""
-    m, vertices = 0, w.length[1]
-    for i in range(voxels):
-        v = w.voxel[i]
-        length = store.voxel[v, PATCH_LEN]
-        if length == 0:
+def list_triangles(store: Store, camera: Camera, v: int, w: Visible) -> bool:
+    """List the triangles of a voxel all of whose vertices lie in front of the camera; False when a list is full."""
+    length = store.voxel[v, PATCH_LEN]
+    if length == 0:
+        return True
+    m = int(w.length[1])
+    if m + length > w.triangle.shape[0]:
+        return False
+    bs.neighbours27(store, v, w.neighbour)
+    at = store.voxel[v, PATCH_AT]
+    for t in range(at, at + length):
+        i = _living(store, w, np.int64(store.triangle[t, 0]) & EAR_MASK)
+        j = _living(store, w, np.int64(store.triangle[t, 1]))
+        k = _living(store, w, np.int64(store.triangle[t, 2]))
+        if i < 0 or j < 0 or k < 0:
             continue
-        bs.neighbours27(store, v, w.neighbour)
-        at = store.voxel[v, PATCH_AT]
-        for t in range(at, at + length):
-            a = _row_of(store, w, np.int64(store.triangle[t, 0]) & EAR_MASK, vertices)
-            b = _row_of(store, w, np.int64(store.triangle[t, 1]), vertices)
-            c = _row_of(store, w, np.int64(store.triangle[t, 2]), vertices)
-            if a < 0 or b < 0 or c < 0 or math.isnan(w.pixel[a, 0] + w.pixel[b, 0] + w.pixel[c, 0]):
-                continue
-            w.triangle[m, 0], w.triangle[m, 1], w.triangle[m, 2] = a, b, c
-            w.owner[m] = v
-            m += 1
-    return m
+        a, b, c = row_of(w, i), row_of(w, j), row_of(w, k)
+        if a < 0 or b < 0 or c < 0:  # of a block that comes later
+            a = add_vertex(store, camera, i, w) if a < 0 else a
+            b = add_vertex(store, camera, j, w) if b < 0 else b
+            c = add_vertex(store, camera, k, w) if c < 0 else c
+            if a < 0 or b < 0 or c < 0:
+                return False
+        if math.isnan(w.pixel[a, 0] + w.pixel[b, 0] + w.pixel[c, 0]):
+            continue
+        w.triangle[m, 0], w.triangle[m, 1], w.triangle[m, 2] = a, b, c
+        w.owner[m] = v
+        m += 1
+    w.length[1] = m
+    return True
 
 
 @kernel
@@ -241,19 +332,6 @@ class Depth(NamedTuple):
     step: int
 
 
-def depth_map(visible: Visible, camera: Camera, step: int) -> Depth:
-    """Reference depth d_ref of eq. 11: the nearest surface of the current mesh.
-
-    Corners are put where the lens puts them and edges are drawn straight: between vertices 0.1 m apart a lens
-    bends an edge by much less than a pixel of this map.
-    """
-    nearness = np.zeros((-(-camera.height // step), -(-camera.width // step)), np.float32)
-    draw_nearness(visible.pixel, visible.triangle[: visible.length[2]], 1.0 / step, nearness)
-    return Depth(
-        nearness, cv2.dilate(nearness, np.ones((3, 3), np.uint8)).astype(np.float32, copy=False), step
-    )
-
-
 @kernel
 def draw_nearness(pixel: F32, triangle: I32, scale: float, nearness: F32) -> None:
     """Draw triangles (m, 3) of image points (n, 3) u, v, 1 / z into a z-buffer of 1 / z, which is linear there."""
@@ -278,10 +356,12 @@ def draw_nearness(pixel: F32, triangle: I32, scale: float, nearness: F32) -> Non
         b_u, b_v = (cv - av) * k_area, -(cu - au) * k_area
         c_u, c_v = -(bv - av) * k_area, (bu - au) * k_area
         da, db, dc = np.float64(a[2]), np.float64(b[2]) - a[2], np.float64(c[2]) - a[2]
+        du = first_u - au
         for row in range(first_v, last_v + 1):
+            dv = row - av
+            wb, wc = b_u * du + b_v * dv, c_u * du + c_v * dv
             for column in range(first_u, last_u + 1):
-                du, dv = column - au, row - av
-                wb, wc = b_u * du + b_v * dv, c_u * du + c_v * dv
                 if wb >= 0.0 and wc >= 0.0 and wb + wc <= 1.0:
                     near = np.float32(da + wb * db + wc * dc)
                     nearness[row, column] = max(nearness[row, column], near)
+                wb, wc = wb + b_u, wc + c_u
