@@ -16,8 +16,8 @@ Rng = np.random.Generator
 
 INPUT = (480, 384)  # width, height that whole views are scaled to for the network
 CROP = (288, 224)
-_SCALE = (0.65, 1.1)  # of the views, whose crops these are
-_SOUGHT_SCALE = (0.65, 1.4)  # of crops that look for a class
+_SCALE = (0.75, 1.2)  # of the views, whose crops these are
+_SOUGHT_SCALE = (0.75, 1.25)  # of crops that look for a class
 _ASIDE = 60  # pixels of the view that such a crop's middle is beside a pixel of the class at most
 #: How often crops look for a class, relative to each other (0.5 where not named).
 _SOUGHT = {
@@ -130,11 +130,13 @@ def _crop(photo: U8, label: U8, rng: Rng, scale: float, middle: NDArray[np.float
 
 def _in_other_light(photo: U8, rng: Rng) -> F32:
     """Other exposure, contrast and white balance; at times blur; noise."""
-    picture = photo.astype(np.float32) / 255
-    gain = np.exp(rng.normal(0.0, 0.2)) * np.exp(rng.normal(0.0, 0.05, 3))
-    gamma = float(np.exp(rng.normal(0.0, 0.1)))
-    picture = np.clip(picture * gain.astype(np.float32), 0.0, 1.0) ** np.float32(gamma)
-    if rng.random() < 0.2:
+    gain = np.exp(rng.normal(0.0, 0.12)) * np.exp(rng.normal(0.0, 0.04, 3))
+    gamma = float(np.exp(rng.normal(0.0, 0.06)))
+    level = np.arange(256)[None, :, None] / 255
+    picture = cv2.LUT(photo, (np.clip(level * gain, 0.0, 1.0) ** gamma).astype(np.float32))
+    if rng.random() < 0.1:
         picture = cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.3, 1.0)))
-    noise = np.float32(rng.uniform(0.0, 0.02)) * rng.standard_normal(picture.shape, np.float32)
+    noise = np.empty(picture.shape, np.float32)
+    cv2.setRNGSeed(int(rng.integers(2**31)))
+    cv2.randn(noise, 0.0, float(rng.uniform(0.0, 0.01)))
     return np.asarray(np.clip(picture + noise, 0.0, 1.0), np.float32)

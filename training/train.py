@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 import torch
 from labels import IGNORED, NETWORK_CLASSES
+from muon import Muon
 from network import Network
 from numpy.typing import NDArray
 from samples import Views, batch, whole
@@ -28,8 +29,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 _BATCH = 6
-_RATE, _DECAY = 3e-3, 0.02  # AdamW's learning rate at its highest, and weight decay
-_WARM_UP, _FALL = 0.02, 0.5  # share of the training in which the rate rises, and from which on it falls
+_RATE, _DECAY = 3e-3, 0.02  # learning rate at its highest, and weight decay
+_WARM_UP = 0.02  # share of the training in which the rate rises
 _AVERAGED = 0.995  # the weights kept are a running mean of those learnt
 _RARE = 0.3  # power of a class's share of pixels by which it weighs less
 _REPORT_EVERY, _WRITE_EVERY = 50, 250
@@ -84,8 +85,8 @@ class Clock:
 
 
 def rate_share(done: float) -> float:
-    """Share of the highest rate when so much of the training is done: a rise, a plateau, a straight fall to 0."""
-    return min((done + 1e-3) / _WARM_UP, 1.0, max(1.0 - done, 0.0) / (1.0 - _FALL))
+    """Share of the highest rate when so much of the training is done: a short rise and a straight fall to 0."""
+    return min((done + 1e-3) / _WARM_UP, max(1.0 - done, 0.0))
 
 
 def train(views: Views, how: Plan, out: Path) -> Network:
@@ -99,22 +100,23 @@ def train(views: Views, how: Plan, out: Path) -> Network:
     mean = torch.optim.swa_utils.AveragedModel(
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(_AVERAGED), use_buffers=True
     )
-    optimiser = torch.optim.AdamW(_groups(network), lr=how.rate)
+    optimisers = _optimisers(network, how.rate)
     order, clock, total = epochs(len(views), rng), Clock(how), 0.0
     network.train()
     step, done = 0, 0.0
     while done < 1.0:
-        for group in optimiser.param_groups:
+        for group in (group for optimiser in optimisers for group in optimiser.param_groups):
             group["lr"] = how.rate * rate_share(done)
         picture, label = batch(views, rng, [next(order) for _ in range(_BATCH)], how.sought)
         down, right = rng.integers(0, 2, 2)  # each logit stands for four pixels, which teach it in turns
         taught = torch.from_numpy(label[:, down::2, right::2].astype(np.int64))
         pictures = torch.from_numpy(picture).contiguous(memory_format=torch.channels_last)
         loss = loss_of(network(pictures), taught, weights)
-        optimiser.zero_grad()
+        network.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 2.0)
-        optimiser.step()
+        for optimiser in optimisers:
+            optimiser.step()
         mean.update_parameters(network)
         total += float(loss.detach())
         step += 1
@@ -132,11 +134,15 @@ def train(views: Views, how: Plan, out: Path) -> Network:
     return learnt.eval()
 
 
-def _groups(network: Network) -> list[dict[str, object]]:
-    """Only the weights of convolutions decay."""
-    decaying = [p for p in network.parameters() if p.ndim > 1]
-    others = [p for p in network.parameters() if p.ndim <= 1]
-    return [{"params": decaying, "weight_decay": _DECAY}, {"params": others, "weight_decay": 0.0}]
+def _optimisers(network: Network, rate: float) -> list[torch.optim.Optimizer]:
+    """Muon for what mixes channels within the network; AdamW for its first and last layer, filters and biases."""
+    inner, others = [], []
+    for name, p in network.named_parameters():
+        mixes = p.ndim == 2 or (p.ndim == 4 and p.shape[1] > 1)
+        (inner if mixes and not name.startswith(("stem.", "logits.")) else others).append(p)
+    flat = [p for p in others if p.ndim == 1]
+    groups = [{"params": [p for p in others if p.ndim > 1]}, {"params": flat, "weight_decay": 0.0}]
+    return [Muon(inner, rate, _DECAY), torch.optim.AdamW(groups, lr=rate, weight_decay=_DECAY)]
 
 
 def confusion(network: Network, views: Views) -> NDArray[np.int64]:
