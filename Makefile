@@ -8,13 +8,14 @@ LEARNT ?= train-out
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup demo test lint bench soak wire ablation questions viewer-test terminal-test cluster-test train install-service clean
+.PHONY: help setup demo test lint bench bench-peers soak wire ablation questions viewer-test terminal-test cluster-test train install-service clean
 
 help:
 	@echo "make demo    walk through a virtual street, map it, measure the map (writes $(OUT)/)"
 	@echo "make test    the tests (those on real recordings need ARTEMIS_DATA)"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   what a frame costs on this machine"
+	@echo "make bench-peers  what the odometry costs a frame, beside KISS-ICP and small_gicp (fetched; a few minutes)"
 	@echo "make soak    a virtual walk of 20 minutes: flat cost, bounded memory"
 	@echo "make wire    a minute played on the wire by virtual devices: losses and CPU of the service (some minutes)"
 	@echo "make viewer-test  GLB and browser view in headless Chromium (fetches three.js with npm)"
@@ -51,6 +52,10 @@ lint: $(READY)
 
 bench: $(READY)
 	@$(BIN)/artemis-edge bench
+
+bench-peers: $(READY)
+	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install -qq --only-binary :all: -e '.[dev,loop]' 'kiss-icp>=1.3'
+	@$(BIN)/python tests/bench/bench_peers.py
 
 soak: $(READY)
 	@$(BIN)/python tests/soak/walk.py

@@ -1,55 +1,131 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from artemis_edge.frames import DeskewedScan
-from artemis_edge.odometry.normals import CELL_M, normal_spread, weakest_direction
-from artemis_edge.odometry.plane_map import PlaneMap, sum_points
+from artemis_edge.odometry.normals import (
+    CELL_M,
+    by_cell,
+    draw,
+    fit,
+    keep,
+    normal_spread,
+    tilt2,
+    weakest_direction,
+)
+from artemis_edge.odometry.plane_map import PlaneMap
+
+SIGMA_M = 0.03
 
 
-def slow_spread(points):
-    """Twin of ``normal_spread`` from the points themselves, by eigenvectors."""
-    total, count = np.zeros((3, 3)), 0
-    cells = np.floor(points / CELL_M).astype(int)
-    for cell in np.unique(cells, axis=0):
-        p = points[(cells == cell).all(axis=1)]
-        if len(p) < 12:
-            continue
-        values, vectors = np.linalg.eigh(np.cov(p.T, bias=True))
-        tilt = values[0] / (len(p) - 3) / values[1:]
-        if tilt.sum() > 0.05:
-            continue
-        n = np.outer(vectors[:, 0], vectors[:, 0])
-        for t, e in zip(tilt, vectors.T[1:], strict=True):
-            n += t * (np.outer(vectors[:, 0], vectors[:, 0]) - np.outer(e, e))
-        total += len(p) * n
-        count += len(p)
-    return total, count
+def slow_cells(points):
+    """Twin of ``by_cell``: rows of each cell, cells in order of their first point."""
+    found = {}
+    for row, cell in enumerate(np.floor(points / CELL_M).astype(int).tolist()):
+        found.setdefault(tuple(cell), []).append(row)
+    return list(found.values())
+
+
+def slow_fit(points):
+    """Twin of ``fit``."""
+    values, vectors = np.linalg.eigh(np.cov(points.T, bias=True))
+    return vectors[:, 0], values, vectors[:, 0] @ points.mean(axis=0)
+
+
+def slow_draw(points, m, sigma_m):
+    """Twin of ``draw``: normal and offset of the best of twelve planes through three points."""
+    best, judges = (0.0, None), points[:: max(m // 50, 1)]
+    for i in (t * m // 36 for t in range(12)):
+        p, q, r = points[i], points[i + m // 3], points[i + 2 * m // 3]
+        normal = np.cross(q - p, r - p)
+        if np.linalg.norm(normal) > 0.0:
+            normal /= np.linalg.norm(normal)
+            score = (1.0 / (1.0 + ((judges - p) @ normal / sigma_m) ** 4)).sum()
+            best = max(best, (score, (normal, normal @ p)), key=lambda found: found[0])
+    return best[1]
 
 
 def weakest(points, map_points=None):
     planes = PlaneMap(0.5, 4, 10_000)
     planes.insert(points if map_points is None else map_points, np.eye(4))
-    return weakest_direction([DeskewedScan(points, np.zeros(3))], planes, np.eye(4))
+    return weakest_direction([DeskewedScan(points, np.zeros(3))], planes, np.eye(4), SIGMA_M)
 
 
 def walls(rng, share, count=6000, noise=0.02):
     """Floor and side walls along x, and a share of points on a wall across."""
     p = rng.uniform([0, 0, 0], [8, 3, 3], (count, 3))
     kind = rng.uniform(size=count)
-    p[kind < 0.5, 1] = 0.1
-    p[(kind >= 0.5), 2] = 0.1
-    p[kind < share, 0] = 4.1
+    p[kind < 0.5, 1] = 0.15
+    p[(kind >= 0.5), 2] = 0.15
+    p[kind < share, 0] = 4.05
     p[kind < share, 1] = rng.uniform(0, 3, (kind < share).sum())
     return (p + noise * rng.normal(size=p.shape)).astype(np.float32)
 
 
-def test_like_the_slow_twin():
-    points = walls(np.random.default_rng(0), 0.1)
-    _, sums = sum_points(points, np.eye(4), CELL_M)
-    found, known = normal_spread(sums)
-    wanted, count = slow_spread(points.astype(float))
-    assert sums[known, 0].sum() == count > 1000
-    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-3 * count)
+def corner(rng, count=120):
+    """Two thirds of the points of a cell on one wall, the others on one across; the first wall's rows first."""
+    p = rng.uniform(0, CELL_M, (count, 3))
+    p[: 2 * count // 3, 0] = 0.28
+    p[2 * count // 3 :, 1] = 0.02
+    return (p + 0.01 * rng.normal(size=p.shape)).astype(np.float32)
+
+
+def test_cells_like_the_slow_twin():
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3)).astype(np.float32)
+    order, starts = by_cell(points, CELL_M)
+    assert [order[a:b].tolist() for a, b in pairwise(starts)] == slow_cells(points)
+
+
+def test_a_drawn_plane_is_that_of_the_slow_twin():
+    points = corner(np.random.default_rng(1))
+    shuffled = np.random.default_rng(2).permutation(len(points))
+    plane = np.empty(7)
+    assert draw(points, shuffled, SIGMA_M, plane)
+    normal, offset = slow_draw(points[shuffled].astype(float), len(points), SIGMA_M)
+    np.testing.assert_allclose(plane[[0, 1, 2, 6]], [*normal, offset], atol=1e-5)
+
+
+def test_points_of_another_surface_are_sorted_out():
+    points = corner(np.random.default_rng(1))
+    rows, plane = np.random.default_rng(2).permutation(len(points)), np.empty(7)
+    draw(points, rows, SIGMA_M, plane)
+    n = keep(points, rows, plane, 0.05)
+    near = np.abs(points @ plane[:3] - plane[6]) < 0.05
+    assert sorted(rows[:n]) == np.flatnonzero(near).tolist() and sorted(rows) == list(range(len(points)))
+    fit(points, rows[:n], plane)
+    normal, values, offset = slow_fit(points[rows[:n]].astype(float))
+    sign = np.sign(plane[:3] @ normal)
+    np.testing.assert_allclose(plane[[0, 1, 2, 6]], sign * np.array([*normal, offset]), atol=1e-5)
+    np.testing.assert_allclose(plane[3:6], values, rtol=1e-3, atol=1e-9)
+    assert abs(plane[0]) > 0.98
+
+
+def test_the_tilt_of_a_fitted_plane_is_what_is_said():
+    rng, tilts, said = np.random.default_rng(3), [], []
+    for _ in range(300):
+        p = np.column_stack([rng.uniform(-0.1, 0.1, (30, 2)), 0.02 * rng.normal(size=30)]).astype(np.float32)
+        plane = np.empty(7)
+        fit(p, np.arange(30), plane)
+        tilts.append(plane[0] ** 2 + plane[1] ** 2)
+        said.append(tilt2(plane, 30))
+    assert np.mean(tilts) == pytest.approx(np.mean(said), rel=0.25)
+
+
+def test_a_line_has_any_normal():
+    line = np.linspace([0, 0, 0], [0.2, 0.1, 0], 30).astype(np.float32)
+    plane = np.empty(7)
+    fit(line, np.arange(30), plane)
+    assert not tilt2(plane, 30) < 1.0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_the_mean_has_no_bias_by_noise(noise):
+    points = walls(np.random.default_rng(4), 0.1, 20_000, noise)
+    order, starts = by_cell(points, CELL_M)
+    spread, known = normal_spread(points, order, starts, SIGMA_M)
+    across = spread[0, 0] / np.diff(starts)[known].sum()
+    assert across == pytest.approx(0.1, abs=0.02)
 
 
 @pytest.mark.parametrize("share, degenerate", [(0.0, True), (0.1, False)])
@@ -83,4 +159,4 @@ def test_sparse_points_ask_the_map():
 
 
 def test_no_scans():
-    assert weakest_direction([], PlaneMap(0.5, 4, 10_000), np.eye(4)) is None
+    assert weakest_direction([], PlaneMap(0.5, 4, 10_000), np.eye(4), SIGMA_M) is None

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from artemis_edge.calibrate.poses import SmoothPoses, integrated_turns
 from artemis_edge.frames import F64, I64, ImuSamples, Trajectory
+from artemis_edge.odometry.scan_motion import during
 
 _WINDOW = 20  # poses in which a bias of the gyroscope is constant and drift of the odometry small
 _LATEST_S = 0.2  # clocks further apart are not guessed
@@ -159,8 +160,8 @@ def fit_position(poses: Trajectory, imu: ImuSamples) -> tuple[F64, F64]:
     each window's start and velocity: p_k + R_k r = p_0 + v_0 t + g t^2 / 2 + double integral of R (a - b).
     """
     smooth = SmoothPoses(poses, imu)
-    inside = (imu.stamp_ns >= poses.stamp_ns[0]) & (imu.stamp_ns <= poses.stamp_ns[-1])
-    stamp, accel = imu.stamp_ns[inside], imu.accel[inside]
+    near = during(imu, int(poses.stamp_ns[0]), int(poses.stamp_ns[-1]))
+    stamp, accel = near.stamp_ns, near.accel
     R = smooth.at(stamp)[:, :3, :3]
     rows, values = [], []
     for first in range(0, len(poses) - _SHORT, _SHORT // 2):
@@ -180,8 +181,9 @@ def fit_position(poses: Trajectory, imu: ImuSamples) -> tuple[F64, F64]:
 def _window(pose_ns: I64, T: F64, stamp: I64, R: F64, accel: F64) -> tuple[F64, F64]:
     """Equations of one window for place, bias and gravity; start and velocity are projected out."""
     start = int(pose_ns[0])
-    low, high = np.searchsorted(stamp, [pose_ns[0], pose_ns[-1]], side="right")
-    low = max(int(low) - 1, 0)
+    # one sample beyond either end: an integral that stops at the last one before is short by up to 5 ms of speed
+    low = max(int(np.searchsorted(stamp, pose_ns[0], "right")) - 1, 0)
+    high = int(np.searchsorted(stamp, pose_ns[-1], "left")) + 1
     s, t = _seconds(stamp[low:high], start), _seconds(pose_ns, start)
     force = np.einsum("nij,nj->ni", R[low:high], accel[low:high])
     moved = _twice(s, force, t)

@@ -19,11 +19,14 @@ from artemis_edge.frames import F64, FrameSource, Odometry
 from artemis_edge.odometry import se3
 from artemis_edge.trajectory import inverse
 
-_ROUNDS = 3  # the odometry is better with a better IMU, and the IMU with better odometry
+# The odometry is better with a better IMU, and the IMU with better odometry. Of each round, how far the IMU may be
+# turned: an odometry that trusts a gyroscope too much repeats its mount, and every round finds but a part of the error
+_UNSURE_RAD = (0.035, 0.01, 0.01, 0.01)
 _SETTLED_RAD, _SETTLED_S = 3e-4, 1e-4
 _LEAST_FRAMES = 10
 
-MakeOdometry = Callable[[FrameSource], Odometry]
+#: Makes the odometry of a source whose IMU may be turned by so many radian (one sigma).
+MakeOdometry = Callable[[FrameSource, float], Odometry]
 Report = Callable[[int, int], None]
 
 
@@ -60,9 +63,9 @@ def refine(source: FrameSource, make: MakeOdometry, report: Report) -> Refined:
         )
     imu = ImuMount()
     fit: ImuFit | None = None
-    for _ in range(_ROUNDS):
+    for unsure_rad in _UNSURE_RAD:
         seen = CalibratedSource(source, Mounts(imu=imu))
-        material = collect(seen, make(seen), False, report)
+        material = collect(seen, make(seen, unsure_rad), False, report)
         fit = None if material.stations else fit_imu(material.trajectory, material.imu)
         if fit is None:
             break
@@ -70,7 +73,7 @@ def refine(source: FrameSource, make: MakeOdometry, report: Report) -> Refined:
         if np.linalg.norm(fit.rotation) < _SETTLED_RAD and abs(fit.time_offset_s) < _SETTLED_S:
             break
     seen = CalibratedSource(source, Mounts(imu=imu))
-    material = collect(seen, make(seen), True, report)
+    material = collect(seen, make(seen, 0.0), True, report)
     refined = Refined(Mounts(imu=imu), material, fit)
     if fit is not None:
         _judge_imu(refined, imu, fit)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+
+import msgspec
 
 from artemis_edge.calibrate.refine import MakeOdometry
 from artemis_edge.config import Config, InputConfig
@@ -11,6 +14,8 @@ from artemis_edge.frames import FrameSource, Odometry
 from artemis_edge.odometry.choice import odometry_for
 from artemis_edge.odometry.given_poses import GivenPoses
 from artemis_edge.trajectory import read_tum
+
+_TURN_RATE, _TURN_S = 0.5, 0.5  # rad/s, s: of a rig that is turned about all axes by hand
 
 
 def open_for_calibration(
@@ -23,10 +28,13 @@ def open_for_calibration(
         given = source.poses
     if given is not None:
         known = GivenPoses(given)
-        return source, lambda _: known
+        return source, lambda _seen, _unsure_rad: known
     config = Config().odometry
 
-    def estimate(seen: FrameSource) -> Odometry:
-        return odometry_for(config, lambda: seen.frames())
+    def estimate(seen: FrameSource, unsure_rad: float) -> Odometry:
+        # a turned IMU shows a turn about a wrong axis as long as the turn lasts
+        wrong = unsure_rad * _TURN_RATE * math.sqrt(_TURN_S)
+        noise = math.hypot(config.gyro_noise, wrong)
+        return odometry_for(msgspec.structs.replace(config, gyro_noise=noise), lambda: seen.frames())
 
     return source, estimate

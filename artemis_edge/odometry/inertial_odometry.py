@@ -234,7 +234,7 @@ class InertialOdometry:
         first_s, last_s = window(frame)
         motion = path.motion(state, first_s + since_s, last_s + since_s)
         scans = deskew_frame(frame, motion.referred_to(since_s))
-        weakest = weakest_direction(scans, self._map.planes, at.T_world_lidar)
+        weakest = weakest_direction(scans, self._map.planes, at.T_world_lidar, self._config.sigma_m)
         degenerate = weakest is not None and weakest.degenerate
         return TrackedFrame(
             frame.index,

@@ -171,16 +171,20 @@ class VisualUpdate:
         known: Patches,
     ) -> Patches:
         """The most telling patch of each free cell of an image."""
+        free = _free(seen, T_cam_world, known.anchor[:, :3])
+        T_cam_lidar = T_cam_world @ T_world_lidar
+        points = points[
+            free[_cells(seen, T_cam_lidar, points.astype(np.float64))]
+        ]  # most cells have their patch already
         matched = match(planes, points, T_world_lidar, 0, _NOISE_M**2)
         centres = matched[:, :3] @ T_world_lidar[:3, :3].T + T_world_lidar[:3, 3]
         normals = matched[:, 3:6]
         centres -= (np.einsum("ij,ij->i", normals, centres) - matched[:, 6])[:, None] * normals
-        taken = _cells(seen, T_cam_world, known.anchor[:, :3])
         cell = _cells(seen, T_cam_world, centres)
-        free = _strongest(seen, T_cam_world, centres, np.where(np.isin(cell, taken), -1, cell))
+        chosen = _strongest(seen, T_cam_world, centres, np.where(free[cell], cell, -1))
         T_world_cam = se3.inverse(T_cam_world)
-        anchors, inside = anchors_on(seen.eyes[0], T_world_cam, centres[free], normals[free])
-        cell = cell[free][inside]
+        anchors, inside = anchors_on(seen.eyes[0], T_world_cam, centres[chosen], normals[chosen])
+        cell = cell[chosen][inside]
         grey, slope_s, slope_t, tell = take(seen.pyramid, seen.eyes, T_cam_world, anchors)
         order = np.lexsort((-tell, cell))
         best = order[np.flatnonzero(np.r_[True, np.diff(cell[order]) > 0])] if len(order) else order
@@ -282,6 +286,15 @@ def _strongest(seen: Picture, T_cam_world: F64, points: F64, cell: I64) -> I64:
     ranked = cell[use][order]
     rank = np.arange(len(ranked)) - np.searchsorted(ranked, ranked)
     return use[order[rank < _TRIED]]
+
+
+def _free(seen: Picture, T_cam_world: F64, anchors: F64) -> Bool:
+    """Which cells (n + 1,) of an image hold none of the anchors (m, 3); the last stands for what lies outside."""
+    height, width = seen.pyramid[0].shape
+    free = np.ones(_CELLS * int(np.ceil(_CELLS * height / width)) + 1, np.bool_)
+    free[_cells(seen, T_cam_world, anchors)] = False
+    free[-1] = False
+    return free
 
 
 def _cells(seen: Picture, T_cam_world: F64, points: F64) -> I64:
