@@ -55,8 +55,10 @@ def ask(
         return unanswered(questions, "nothing in it can be looked for")
     backend = open_by_name(questions.model, questions.thresholds)
     brush = MeshBrush(mesh, questions.names, config.semantics, config.voxel_map.voxel_m / 4)
-    for keyframe, seen in segment_all(read_keyframes(folder), backend, questions.prompts, report):
+    keyframes = read_keyframes(folder)
+    for keyframe, seen in segment_all(keyframes, backend, questions.prompts, report):
         brush.refine(keyframe, seen)
+    report(len(keyframes), len(keyframes), "telling objects apart")
     labelled, probability = brush.labelled()
     replies = answer(questions.asked, objects_of(labelled, probability))
     if meshes is not None:

@@ -16,6 +16,7 @@ from artemis_edge.block_store import CLASSES, LOG_CLASS, WEIGHT, Store
 from artemis_edge.class_rows import CLEAR_LOG
 from artemis_edge.config import SemanticsConfig
 from artemis_edge.errors import InputError
+from artemis_edge.export.mesh import edges_of
 from artemis_edge.forgetting import Forgotten, forget_blocks
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraImage
 from artemis_edge.paging import resident_blocks
@@ -226,8 +227,8 @@ def spread_labels(label: U8, known: Bool, normals: F32, faces: I32, rings: int) 
     """Labels of the vertices that are not ``known``, ring by ring over edges between like normals; of several
     neighbours' classes the most frequent, of equally frequent ones the lowest."""
     label, known = label.copy(), known.copy()
-    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
-    edges = np.unique(np.concatenate((edges, edges[:, ::-1])), axis=0)
+    edges = edges_of(faces)
+    edges = np.concatenate((edges, edges[:, ::-1]))
     edges = edges[~known[edges[:, 1]]]
     edges = edges[np.einsum("ij,ij->i", normals[edges[:, 0]], normals[edges[:, 1]]) > _SAME_SURFACE]
     for _ in range(rings):

@@ -13,6 +13,7 @@ from artemis_edge.block_store import CLASSES, LOG_CLASS, WEIGHT
 from artemis_edge.class_rows import are_two_objects, clear_class
 from artemis_edge.config import SemanticsConfig
 from artemis_edge.errors import InputError
+from artemis_edge.export.mesh import edges_of
 from artemis_edge.frames import F32, CameraImage, CameraModel
 from artemis_edge.refinement.semantics import DEEPEST, FLOOR, labels_of, refine
 from artemis_edge.segmentation.backend import DenseScores, Grid
@@ -224,3 +225,14 @@ def _vertex(store: bs.Store, x: float, y: float, z: float) -> int:
 
 def _image(camera: CameraModel) -> CameraImage:
     return CameraImage("cam_0", 0, b"", camera, np.eye(4))
+
+
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_edges_of_triangles(count: int) -> None:
+    faces = (
+        np.random.default_rng(count)
+        .permuted(np.tile(np.arange(9), (count, 1)), axis=1)[:, :3]
+        .astype(np.int32)
+    )
+    pairs = {(min(f[a], f[b]), max(f[a], f[b])) for f in faces.tolist() for a, b in ((0, 1), (1, 2), (2, 0))}
+    assert edges_of(faces).tolist() == [list(pair) for pair in sorted(pairs)]

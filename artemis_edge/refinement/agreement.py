@@ -20,6 +20,7 @@ import math
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
+from artemis_edge.export.mesh import edges_of
 from artemis_edge.frames import F32, I32, U8
 from artemis_edge.refinement.semantics import FLOOR
 
@@ -65,8 +66,7 @@ def agreed(
 
 def neighbours(vertices: F32, normals: F32, faces: I32, known: np.ndarray, spacing_m: float) -> csr_array:
     """w_ij between the vertices ``known`` (k,), float32 (k, k)."""
-    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
-    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    edges = edges_of(faces)
     row = np.full(len(vertices), -1, np.int32)
     row[known] = np.arange(len(known), dtype=np.int32)
     edges = edges[(row[edges] >= 0).all(axis=1)]
