@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -47,6 +48,26 @@ def semantic(folder: Path) -> Backend:
     networks.semantic(folder / "model.onnx")
     classes = ("background", *networks.CLASSES)
     return open_model(manifest("semantic", classes=classes, input_size=(120, 160), stride=8), folder)
+
+
+def test_what_a_class_owes_to_its_frequency_is_taken_out_of_the_map_s_scores(tmp_path: Path) -> None:
+    networks.semantic(tmp_path / "model.onnx")
+    said = manifest("semantic", classes=("background", *networks.CLASSES), input_size=(120, 160), stride=8)
+    shares = (0.6, 0.3, 0.0, 0.1)  # background, car, person, bench
+    image = np.tile(np.array([0, 0, 120], np.uint8), (120, 160, 1))  # a little too dark for a bench
+    prompts = (Prompt(1, "bench"), Prompt(2, "person"), Prompt(3, "bench"))
+    plain = open_model(said, tmp_path).segment(image, prompts)
+    even = open_model(msgspec.structs.replace(said, shares=shares), tmp_path).segment(image, prompts)
+    assert even.dense.slots == plain.dense.slots == (0, 1, 2, 3)
+    # background is what was not asked for, cars too
+    weight = np.array([0.9, 0.1, 0.001, 0.1]) ** -0.25
+    p = plain.dense.score[15, 20] / 255.0
+    wanted = p * weight * p[:3].sum() / (p * weight)[:3].sum()
+    np.testing.assert_allclose(even.dense.score[15, 20] / 255.0, wanted, atol=0.012)
+    assert even.dense.score[15, 20, 1] > plain.dense.score[15, 20, 1]
+    assert [(a.status, a.score) for a in even.answers] == [(a.status, a.score) for a in plain.answers]
+    with pytest.raises(InputError, match="shares"):
+        open_model(msgspec.structs.replace(said, shares=shares[:3]), tmp_path)
 
 
 def semantic_fixed(folder: Path) -> Backend:

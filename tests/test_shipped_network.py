@@ -45,6 +45,8 @@ def test_it_is_small_and_the_file_of_its_manifest_and_says_what_it_is_for() -> N
     assert file_hash(folder / manifest.file) == manifest.sha256
     assert manifest.synthetic_only and "virtual worlds only" in manifest.note
     assert set(manifest.classes) == set(CLASS_NAMES) - {"glass"}
+    assert len(manifest.shares) == len(manifest.classes)
+    assert abs(sum(manifest.shares) - 1.0) < 1e-3
 
 
 @pytest.fixture(scope="module")

@@ -63,6 +63,14 @@ def calibrate(network: Network, views: Views) -> tuple[float, Tensor]:
     return float(1 / cooler), bias.detach()
 
 
+def class_shares(views: Views) -> list[float]:
+    """Share of each class in the labelled pixels of the views that probabilities are calibrated on."""
+    count = sum(
+        np.bincount(label[label != IGNORED].ravel(), minlength=len(NETWORK_CLASSES)) for label in views.labels
+    )
+    return [round(float(share), 5) for share in count / np.sum(count)]
+
+
 def _cells(network: Network, views: Views) -> tuple[Tensor, Tensor]:
     """Logits (n, classes) and labels (n,) of cells spread over the views."""
     logits, labels = [], []
@@ -98,8 +106,8 @@ def halved(model: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def write(network: Network, folder: Path) -> Path:
-    """``NAME.onnx`` and ``NAME.json``."""
+def write(network: Network, folder: Path, shares: Sequence[float]) -> Path:
+    """``NAME.onnx`` and ``NAME.json``; ``shares`` as of :func:`class_shares`."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{NAME}.onnx"
     example = torch.zeros(1, 3, INPUT[1], INPUT[0])
@@ -116,11 +124,11 @@ def write(network: Network, folder: Path) -> Path:
     model = halved(onnx.load(str(path)))
     model.graph.doc_string = _NOTE
     onnx.save(model, str(path))
-    _write_manifest(path)
+    _write_manifest(path, shares)
     return path
 
 
-def _write_manifest(path: Path) -> None:
+def _write_manifest(path: Path, shares: Sequence[float]) -> None:
     manifest = {
         "name": NAME,
         "kind": "semantic",
@@ -128,6 +136,7 @@ def _write_manifest(path: Path) -> None:
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "licence": "that of this program",
         "classes": list(NETWORK_CLASSES),
+        "shares": list(shares),
         "input_size": [INPUT[1], INPUT[0]],
         "stride": _STRIDE,
         "inputs": {"image": [1, 3, 0, 0]},
@@ -150,10 +159,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     network = Network(len(NETWORK_CLASSES))
     network.load_state_dict(torch.load(given.weights))
     network.eval()
-    temperature, bias = calibrate(network, Views(list(given.calibrate.glob("*.npz"))))
+    views = Views(sorted(given.calibrate.glob("*.npz")))
+    temperature, bias = calibrate(network, views)
     spread = ", ".join(f"{n} {b:+.2f}" for n, b in zip(NETWORK_CLASSES, bias.tolist(), strict=True))
     print(f"temperature {temperature:.3f}; biases {spread}")
-    path = write(network, given.out)
+    path = write(network, given.out, class_shares(views))
     print(f"{path}: {path.stat().st_size} bytes")
     return 0
 

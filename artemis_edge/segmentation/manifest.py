@@ -33,6 +33,8 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ``input_size`` is (height, width) of the input. Where the file leaves height and width open, images are scaled
     to fit into it and padded to the next multiple of ``stride`` only.
     ``mean`` and ``std`` per channel, RGB on 0..1: the network is given (rgb / 255 - mean) / std.
+    ``shares`` of the classes in the pixels that the probabilities of a ``semantic`` network were calibrated on, in the
+    order of ``classes`` (empty: not known).
     ``synthetic_only``: trained on virtual worlds, of no use on photographs.
     """
 
@@ -46,6 +48,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     stride: Annotated[int, Meta(ge=1, le=128)] = 32
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    shares: tuple[Annotated[float, Meta(ge=0.0, le=1.0)], ...] = ()
     parts: dict[str, Part] = {}
     inputs: dict[str, tuple[int, ...]] = {}
     outputs: dict[str, tuple[int, ...]] = {}

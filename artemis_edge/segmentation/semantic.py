@@ -29,6 +29,10 @@ from artemis_edge.segmentation.yolo_seg import Thresholds, closed_support, input
 
 _LEAST_CELLS = 4  # smaller patches are noise of single cells
 _PAD = 0
+# Exponent of a class' share that each image's probabilities are divided by (docs/semantics.md)
+_TAKEN_OUT = 0.25
+# Share of a class that calibration hardly saw
+_RAREST = 1e-3
 
 
 def probabilities(logits: Array) -> F32:
@@ -38,6 +42,18 @@ def probabilities(logits: Array) -> F32:
     np.exp(weight, out=weight)
     weight /= weight.sum(axis=0)
     return weight
+
+
+def without_frequency(probability: F32, shares: F32) -> F32:
+    """Probabilities (h, w, k), each divided by its class' share in ``shares`` (k,) to a power; sums stay as they are.
+
+    Calibrated probabilities hold how frequent a class is. A map that adds up what many images say would count that
+    once an image, and what is rare and small would be lost to what is behind it.
+    """
+    out = probability * (np.maximum(shares, _RAREST) ** -_TAKEN_OUT).astype(np.float32)
+    total = np.maximum(out.sum(axis=2, keepdims=True), np.float32(1e-9))
+    balanced: F32 = out * (probability.sum(axis=2, keepdims=True) / total)
+    return balanced
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +74,9 @@ class Semantic:
         self._network = network
         self._manifest = manifest
         self._thresholds = thresholds
+        self._shares = np.array(manifest.shares, np.float32)
+        if len(self._shares) not in (0, len(self.classes)):
+            raise InputError(f"the manifest of {self.name} names another number of shares than of classes")
         self._row = {canonical(label): k for k, label in reversed(list(enumerate(manifest.classes)))}
         self._row.pop("background", None)
 
@@ -92,12 +111,15 @@ class Semantic:
 
     def _dense(self, view: _View, prompts: Sequence[Prompt]) -> DenseScores:
         """A layer a prompt; what is left of probability 1 is background."""
-        layers = [view.probability[self._row[prompt.text]] for prompt in prompts]
-        nothing = np.ones(view.probability.shape[1:], np.float32)
-        for layer in {self._row[prompt.text] for prompt in prompts}:
-            nothing -= view.probability[layer]
+        rows = list(dict.fromkeys(self._row[prompt.text] for prompt in prompts))
+        nothing = 1.0 - view.probability[rows].sum(axis=0)
+        score = np.stack([nothing, *view.probability[rows]], axis=2)
+        if len(self._shares):
+            wanted = self._shares[rows]
+            score = without_frequency(score, np.append(1.0 - wanted.sum(), wanted).astype(np.float32))
+        layers = [0, *(1 + rows.index(self._row[prompt.text]) for prompt in prompts)]
         slots = (BACKGROUND, *(prompt.slot for prompt in prompts))
-        return DenseScores(slots, scores.quantised(np.stack([nothing, *layers], axis=2)), view.grid)
+        return DenseScores(slots, scores.quantised(score[:, :, layers]), view.grid)
 
     def _instances(self, view: _View, prompts: Sequence[Prompt]) -> list[Instance]:
         winner = view.probability.argmax(axis=0)

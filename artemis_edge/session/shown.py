@@ -20,8 +20,8 @@ _SLACK_M = 0.01  # before a point, of its own surface
 def views_of(rig: Rig, points: F32, stamps_ns: Iterable[int], reach_m: float) -> I32:
     """How many of the photographs taken at ``stamps_ns`` show each of ``points`` (n, 3, session frame), int32 (n,).
 
-    A photograph shows what lies in its frame within ``reach_m`` along its axis, with a free line of sight; panes
-    of glass hide nothing. What moves is taken to hide nothing, too.
+    A photograph shows what lies in its frame within ``reach_m`` along its axis, with a free line of sight. Panes of
+    glass hide what beams find behind them: the camera sees the sky in them. What moves is taken to hide nothing.
     """
     out = np.zeros(len(points), np.int32)
     T = inverse(rig.T_session_world())
@@ -33,7 +33,7 @@ def views_of(rig: Rig, points: F32, stamps_ns: Iterable[int], reach_m: float) ->
         eye = (T_world_cam[:3, 3] - scene.origin)[None]
         near = np.ascontiguousarray(world[rows] - scene.origin)
         eyes = np.zeros((len(rows), 1), np.int32)
-        free = first_free_line(scene.bvh, near, eye, eyes, _SLACK_M, scene.panes[0])
+        free = first_free_line(scene.bvh, near, eye, eyes, _SLACK_M)
         out[rows[free >= 0]] += 1
     return out
 
