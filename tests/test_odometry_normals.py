@@ -6,13 +6,17 @@ import pytest
 from artemis_edge.frames import DeskewedScan
 from artemis_edge.odometry.normals import (
     CELL_M,
+    RADIUS_M,
     by_cell,
     draw,
     fit,
+    in_ball,
     keep,
+    mean,
     normal_spread,
     tilt2,
     weakest_direction,
+    within,
 )
 from artemis_edge.odometry.plane_map import PlaneMap
 
@@ -35,9 +39,13 @@ def slow_fit(points):
 
 def slow_draw(points, m, sigma_m):
     """Twin of ``draw``: normal and offset of the best of twelve planes through three points."""
-    best, judges = (0.0, None), points[:: max(m // 50, 1)]
-    for i in (t * m // 36 for t in range(12)):
-        p, q, r = points[i], points[i + m // 3], points[i + 2 * m // 3]
+    best, judges, seed = (0.0, None), points[:: max(m // 50, 1)], 1
+    for _ in range(12):
+        rows = []
+        for _ in range(3):
+            seed = (seed * 1103515245 + 12345) % 2**31
+            rows.append(seed // 2**16 % m)
+        p, q, r = points[rows]
         normal = np.cross(q - p, r - p)
         if np.linalg.norm(normal) > 0.0:
             normal /= np.linalg.norm(normal)
@@ -52,7 +60,7 @@ def weakest(points, map_points=None):
     return weakest_direction([DeskewedScan(points, np.zeros(3))], planes, np.eye(4), SIGMA_M)
 
 
-def walls(rng, share, count=6000, noise=0.02):
+def walls(rng, share, count=12_000, noise=0.02):
     """Floor and side walls along x, and a share of points on a wall across."""
     p = rng.uniform([0, 0, 0], [8, 3, 3], (count, 3))
     kind = rng.uniform(size=count)
@@ -73,8 +81,29 @@ def corner(rng, count=120):
 
 def test_cells_like_the_slow_twin():
     points = np.random.default_rng(0).uniform(-1, 1, (500, 3)).astype(np.float32)
-    order, starts = by_cell(points, CELL_M)
-    assert [order[a:b].tolist() for a, b in pairwise(starts)] == slow_cells(points)
+    cells = by_cell(points, CELL_M)
+    assert [cells.order[a:b].tolist() for a, b in pairwise(cells.starts)] == slow_cells(points)
+
+
+@pytest.mark.parametrize("count", [0, 1, 500, 100_000])
+def test_a_ball_like_the_slow_twin(count):
+    points = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32)
+    cells, rows, centre = by_cell(points, CELL_M), np.empty(400, np.int64), np.array([0.31, -0.02, 0.3])
+    n = in_ball(points, cells, centre, RADIUS_M, rows)
+    inside = np.flatnonzero(np.linalg.norm(points - centre, axis=1) < RADIUS_M)
+    assert set(rows[:n]) <= set(inside) and len(set(rows[:n])) == n
+    if count <= 500:
+        assert n == len(inside)
+    else:  # a ball is a fifteenth of the eight cells that it touches, of which 300 points are looked at
+        assert 10 < n < 40
+        np.testing.assert_allclose(points[rows[:n]].mean(axis=0), centre, atol=0.06)
+
+
+def test_the_mean_of_some_rows():
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3)).astype(np.float32)
+    out = np.empty(3)
+    mean(points, np.arange(10, 30), out)
+    np.testing.assert_allclose(out, points[10:30].mean(axis=0), atol=1e-6)
 
 
 def test_a_drawn_plane_is_that_of_the_slow_twin():
@@ -92,6 +121,7 @@ def test_points_of_another_surface_are_sorted_out():
     draw(points, rows, SIGMA_M, plane)
     n = keep(points, rows, plane, 0.05)
     near = np.abs(points @ plane[:3] - plane[6]) < 0.05
+    assert n == within(points, np.arange(len(points)), plane, 0.05)
     assert sorted(rows[:n]) == np.flatnonzero(near).tolist() and sorted(rows) == list(range(len(points)))
     fit(points, rows[:n], plane)
     normal, values, offset = slow_fit(points[rows[:n]].astype(float))
@@ -122,10 +152,29 @@ def test_a_line_has_any_normal():
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_the_mean_has_no_bias_by_noise(noise):
     points = walls(np.random.default_rng(4), 0.1, 20_000, noise)
-    order, starts = by_cell(points, CELL_M)
-    spread, known = normal_spread(points, order, starts, SIGMA_M)
-    across = spread[0, 0] / np.diff(starts)[known].sum()
+    cells = by_cell(points, CELL_M)
+    spread, counted, _ = normal_spread(points, cells, RADIUS_M, SIGMA_M)
+    across = spread[0, 0] / counted.sum()
     assert across == pytest.approx(0.1, abs=0.02)
+
+
+def test_of_many_cells_some_are_looked_at():
+    rng = np.random.default_rng(6)
+    p = rng.uniform([0, 0, 0], [15, 15, 3], (120_000, 3))
+    p[:100_000, 2], p[100_000:, 0] = 0.1, 0.1
+    p = (p + 0.01 * rng.normal(size=p.shape)).astype(np.float32)
+    cells = by_cell(p, CELL_M)
+    spread, counted, crowded = normal_spread(p, cells, RADIUS_M, SIGMA_M)
+    assert 500 < np.count_nonzero(counted) <= 1000 < len(counted) and crowded[counted == 0].any()
+    assert spread[0, 0] / counted.sum() == pytest.approx(1 / 6, abs=0.03)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.1, 0.5])
+def test_a_wall_that_cells_cut_faces_its_own_way_only(turn):
+    rng = np.random.default_rng(5)
+    p = np.column_stack([rng.uniform(-2, 2, (10_000, 2)), 0.02 * rng.normal(size=10_000)])
+    R = np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+    assert weakest((p @ R.T).astype(np.float32)).share < 1e-3
 
 
 @pytest.mark.parametrize("share, degenerate", [(0.0, True), (0.1, False)])
