@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -29,42 +30,68 @@ from artemis_edge.commands.common import BAD_USE, DONE, FELL_SHORT, Handler, com
 from artemis_edge.errors import InputError, UserError
 
 DEMO_OUT = Path("demo-out")
+_INTERRUPTED = "artemis-edge: interrupted; complete results are kept, nothing half-written is left"
+_OUT_OF_MEMORY = "artemis-edge: not enough memory; close other programs or lower voxel_map.memory_budget_mb"
 _DEMO_SECONDS, _SIMULATED_SECONDS, _SEED = 12.0, 20.0, 1
+
+
+class _UsageError(Exception):
+    """A command line that does not parse, as a line for the user."""
 
 
 class _Parser(argparse.ArgumentParser):
     """Usage errors are one line and say where help is."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(BAD_USE, f"{self.prog}: {message}; see '{self.prog} --help'\n")
+        raise _UsageError(f"{self.prog}: {message}; see '{self.prog} --help'")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit code: 0 done, 1 ran and failed or fell short, 2 bad use or input."""
+    """Run one command; returns its exit code: 0 done, 1 ran and failed or fell short, 2 bad use or input.
+
+    With ``--json`` stdout has one object in any case: the result, or ``error`` (the sentence) and ``exit_code``.
+    """
+    words = sys.argv[1:] if arguments is None else arguments
+    _write_anything()
     try:
-        given = _parser().parse_args(arguments)
+        given = _parser().parse_args(words)
         handler: Handler = given.handler
         code = handler(given)
         sys.stdout.flush()
         return code
-    except SystemExit as ending:  # argparse, after help or a usage error
+    except SystemExit as ending:  # argparse, after help
         return ending.code if isinstance(ending.code, int) else BAD_USE
-    except UserError as error:
-        return _tell(str(error), error.exit_code)
-    except (KeyboardInterrupt, SystemError) as error:
-        if not _interrupted(error):
-            raise
-        return _tell("interrupted; complete results are kept, nothing half-written is left", FELL_SHORT)
     except BrokenPipeError:
         # Whoever read our output has left; Python must not try to flush it again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FELL_SHORT
-    except MemoryError:
-        return _tell(
-            "not enough memory; close other programs or lower voxel_map.memory_budget_mb", FELL_SHORT
-        )
-    except OSError as error:
-        return _tell(_os_sentence(error), FELL_SHORT)
+    except Exception as error:
+        line, code = _line(error)
+        return _tell(line, code, "--json" in words)
+    except KeyboardInterrupt:
+        return _tell(_INTERRUPTED, FELL_SHORT, "--json" in words)
+
+
+def _write_anything() -> None:
+    """File names and questions may hold what the terminal's encoding lacks."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _line(error: Exception) -> tuple[str, int]:
+    """What to print and the exit code; what is no fault of user or machine is raised."""
+    match error:
+        case _UsageError():
+            return str(error), BAD_USE
+        case UserError():
+            return f"artemis-edge: {error}", error.exit_code
+        case MemoryError():
+            return _OUT_OF_MEMORY, FELL_SHORT
+        case OSError():
+            return f"artemis-edge: {_os_sentence(error)}", FELL_SHORT
+        case SystemError() if _interrupted(error):
+            return _INTERRUPTED, FELL_SHORT
+    raise error
 
 
 def _interrupted(error: BaseException | None) -> bool:
@@ -74,8 +101,10 @@ def _interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
-def _tell(sentence: str, code: int) -> int:
-    print(f"artemis-edge: {sentence}", file=sys.stderr)
+def _tell(line: str, code: int, json: bool) -> int:
+    print(line, file=sys.stderr)
+    if json:
+        print_json({"error": line.partition(": ")[2], "exit_code": code})
     return code
 
 
@@ -323,6 +352,10 @@ def run_reprocess(given: argparse.Namespace) -> int:
     from artemis_edge import batch, config
     from artemis_edge.runtime import Request
 
+    if given.model and not given.query:
+        raise InputError(
+            f"--model {given.model} looks for nothing without a question; give --query TEXT as well"
+        )
     start, stop = given.frames
     moved = ["voxel_map.dynamic_filter=true"] if given.dynamic_filter else []
     outcomes = batch.run_all(
@@ -359,9 +392,12 @@ def run_reprocess(given: argparse.Namespace) -> int:
 def run_evaluate_mesh(given: argparse.Namespace) -> int:
     """``artemis-edge evaluate mesh``."""
     from artemis_edge.evaluate import mesh
+    from artemis_edge.export.places import check_file
     from artemis_edge.export.ply import find_mesh
 
     thresholds = given.threshold or mesh.DEFAULT_THRESHOLDS
+    if given.heatmap is not None:
+        check_file("--heatmap", given.heatmap, (".png",), (find_mesh(given.mesh), given.reference))
     result = mesh.run(find_mesh(given.mesh), given.reference, thresholds, given.crop)
     if given.heatmap is not None:
         from artemis_edge.session.pictures import write_heat_maps

@@ -11,6 +11,7 @@ import numpy as np
 from artemis_edge.errors import InputError
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F64, U8, Bool
+from artemis_edge.segmentation.query import shown
 
 _OBJECTS = "objects.json"
 _FOUND = ("matched", "approximate")
@@ -25,14 +26,14 @@ def highlighted_triangles(map_path: Path, mesh: Mesh, text: str) -> Bool:
     Case does not matter. Raises InputError when the map has neither.
     """
     objects = [o for o in read_objects(map_path) if _same(str(o.get("text", "")), text)]
-    shown = [o for o in objects if o.get("status") in _FOUND and "box" in o]
-    if shown:
-        found: Bool = np.logical_or.reduce([_in_object(mesh, o) for o in shown])
+    chosen = [o for o in objects if o.get("status") in _FOUND and "box" in o]
+    if chosen:
+        found: Bool = np.logical_or.reduce([_in_object(mesh, o) for o in chosen])
         return found
     labels = [label for label, name in mesh.label_names.items() if label != _BACKGROUND and _same(name, text)]
     if labels:
         return np.isin(face_labels(mesh), labels)
-    raise InputError(f"nothing in this map is known as '{text}'; {_known(map_path, mesh)}")
+    raise InputError(f"nothing in this map is known as '{shown(text)}'; {_known(map_path, mesh)}")
 
 
 def read_objects(map_path: Path) -> list[dict[str, Any]]:

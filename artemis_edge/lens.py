@@ -13,6 +13,10 @@ import numpy as np
 from artemis_edge._jit import njit
 from artemis_edge.frames import F32, F64, CameraModel
 
+# Focal lengths and principal points of cameras [px]: from a fisheye thumbnail to a telescope.
+_SHORTEST_PX, _FARTHEST_PX = 0.1, 1e6
+#: What ``is_camera`` asks for.
+CAMERA_RULE = f"fx and fy must be {_SHORTEST_PX:g} to {_FARTHEST_PX:,.0f} pixels, cx and cy no farther from 0"
 _NEWTON_STEPS = 20  # four or five are enough where the model is sane
 _TOLERANCE = 1e-7  # normalised: below a thousandth of a pixel for any f < 10,000
 
@@ -84,6 +88,13 @@ def corner_radius2(camera: CameraModel) -> float:
     x = max(camera.cx, camera.width - camera.cx)
     y = max(camera.cy, camera.height - camera.cy)
     return float(x * x + y * y)
+
+
+def is_camera(fx: float, fy: float, cx: float, cy: float) -> bool:
+    """Whether these can be focal lengths and principal point of a camera; ``CAMERA_RULE`` says it in words."""
+    return all(_SHORTEST_PX <= f <= _FARTHEST_PX for f in (fx, fy)) and all(
+        abs(c) <= _FARTHEST_PX for c in (cx, cy)
+    )
 
 
 def log_falloff(coefficients: F64 | Sequence[float], q: F64) -> F64:

@@ -20,16 +20,19 @@ from artemis_edge.export.png import png_bytes
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraModel
 from artemis_edge.highlighted import highlighted_triangles
 from artemis_edge.known_lenses import known_falloff
+from artemis_edge.lens import CAMERA_RULE, is_camera, undistorted_lines
 from artemis_edge.lens import falloff as left_by_lens
-from artemis_edge.lens import undistorted_lines
 from artemis_edge.opened_map import map_folder, open_map
+from artemis_edge.progress import say
 from artemis_edge.raster import NOTHING, Projection, draw, interpolate, project
-from artemis_edge.trajectory import inverse, matrix_from_quaternion
+from artemis_edge.trajectory import FARTHEST_M, inverse, matrix_from_quaternion
 
 NEAR_M = 0.05
 # The canvas behind a lens is finer than the picture, so that borders fall within half a pixel of their place.
 _LENS_OVERSAMPLING = 2.0
 _LARGEST_CANVAS = 1 << 25
+_LONGEST_SIDE = 65_535  # of pictures that other programs open
+_SHORTEST = 1e-6  # a quaternion off the unit length by more than this factor is a slip of the pen
 # Where in a pixel the colours are taken whose mean it shows, beside its centre: the turned grid of multisampling
 _WITHIN_PX = ((0.125, 0.375), (0.375, -0.125), (-0.125, -0.375), (-0.375, 0.125))
 # What is highlighted keeps some of its own colour, so that it can be recognised.
@@ -267,6 +270,8 @@ def run(
     chosen = None if highlight is None else highlighted_triangles(map_path, mesh, highlight)
     lens = known_falloff(map_folder(map_path), camera) if falloff else ()
     rgba, z = overlay(mesh, camera, T_world_cam, atlas, chosen, lens)
+    if not rgba[..., 3].any():
+        say("note: nothing of the map is in view from there; --pose is T_world_cam, z forward, y down")
     write_png(out, rgba)
     if depth is not None:
         with replacing(depth) as file:
@@ -281,19 +286,24 @@ def write_png(path: Path, image: U8) -> None:
 def parse_pose(text: str) -> F64:
     """T_world_cam (4, 4) of "tx ty tz qx qy qz qw"; raises InputError."""
     numbers = _numbers(text, 7, "--pose", "tx ty tz qx qy qz qw")
-    if not np.linalg.norm(numbers[3:]) > 0.0:
-        raise InputError("--pose: the quaternion qx qy qz qw must not be zero")
+    if np.abs(numbers[:3]).max() > FARTHEST_M:
+        raise InputError(f"--pose: tx ty tz lie beyond {FARTHEST_M / 1000:,.0f} km; they are in metres")
+    if not _SHORTEST < np.abs(numbers[3:]).max() < 1.0 / _SHORTEST:
+        raise InputError("--pose: the quaternion qx qy qz qw must have the length 1, or near it")
     return matrix_from_quaternion(numbers[:3], numbers[3:])
 
 
 def parse_camera(intrinsics: str, distortion: str | None) -> CameraModel:
     """Camera of "w h fx fy cx cy" and "k1 k2 p1 p2 k3"; raises InputError."""
     w, h, fx, fy, cx, cy = _numbers(intrinsics, 6, "--intrinsics", "w h fx fy cx cy").tolist()
-    if not (w >= 1 and h >= 1 and w == int(w) and h == int(h) and fx > 0 and fy > 0):
-        raise InputError("--intrinsics: w and h must be whole numbers of pixels, fx and fy positive")
-    if w * h > _LARGEST_CANVAS:
+    if not (w >= 1 and h >= 1 and w == int(w) and h == int(h)):
+        raise InputError("--intrinsics: w and h must be whole numbers of pixels")
+    if not is_camera(fx, fy, cx, cy):
+        raise InputError(f"--intrinsics: {CAMERA_RULE}")
+    if w * h > _LARGEST_CANVAS or max(w, h) > _LONGEST_SIDE:
         raise InputError(
-            f"--intrinsics: {w:.0f} x {h:.0f} pixels are too many; ask for at most 33 megapixels"
+            f"--intrinsics: {w:.0f} x {h:.0f} pixels are too many; ask for at most 33 megapixels and "
+            f"{_LONGEST_SIDE} on a side"
         )
     k1, k2, p1, p2, k3 = (
         (0.0,) * 5

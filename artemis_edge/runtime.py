@@ -39,7 +39,7 @@ from artemis_edge.segmentation.yolo_seg import Thresholds
 from artemis_edge.semantic_map import Segmenter
 from artemis_edge.session.photos import INDEX, HeldOut
 from artemis_edge.session.report import Evaluation, RunStatistics, write_report
-from artemis_edge.session.results import Results, preparing, scratch
+from artemis_edge.session.results import Results, preparing, refuse_foreign, scratch
 from artemis_edge.telling import telling
 from artemis_edge.trajectory import hole_sentence, pose_per_frame, read_tum, write_tum
 
@@ -122,6 +122,7 @@ def reprocess(
     odometry = choose_odometry(source, request, span)
     earlier = None if request.go_on is None else open_earlier(request.go_on, request.config)
     statistics = RunStatistics(source.name, source.input_hz, config_toml=to_toml(request.config))
+    refuse_foreign(request.out)
     with preparing(request.out), scratch(request.out) as pages, Answering(request) as answering:
         with Interrupt() as interrupt, telling(request.config.view) as live:
             warm_up_run(request, odometry, pages, source, span, statistics, make)
@@ -357,8 +358,8 @@ def write_results(
     stage: Callable[[str], None] = unheard,
 ) -> dict[str, Any] | None:
     """All results, small ones first; returns the report. ``stage`` is told what comes next."""
-    results.attempt("trajectory.tum", lambda path: write_tum(path, trajectory))
     results.text("config.toml", statistics.config_toml)
+    results.attempt("trajectory.tum", lambda path: write_tum(path, trajectory))
     results.json("objects.json", {"objects": []})
     photos.remove_earlier()
     if photos.every:

@@ -23,7 +23,7 @@ _LAST_S = 9_000_000_000
 # A printed quaternion is a unit quaternion up to rounding; further off, the columns are something else.
 _UNIT_TOLERANCE = 0.05
 # Fifteen times the Earth's radius: beyond any frame on it, and squares stay far from overflow.
-_FARTHEST_M = 1e8
+FARTHEST_M = 1e8
 # Printed stamps are rounded: this far beyond the first or last pose that pose still holds.
 COVER_NS = 1_000_000
 # Between poses this many frame periods apart nobody knows how the sensor moved.
@@ -103,8 +103,8 @@ def _parse_line(line: str, where: str) -> tuple[int, list[float]]:
         raise InputError(f"{where} is not eight numbers; a pose is 'stamp tx ty tz qx qy qz qw'") from None
     if not np.isfinite(values).all():
         raise InputError(f"{where} holds a value that is not finite; remove that pose")
-    if max(abs(value) for value in values[1:4]) > _FARTHEST_M:
-        raise InputError(f"the position in {where} lies beyond {_FARTHEST_M / 1000:,.0f} km; it is in metres")
+    if max(abs(value) for value in values[1:4]) > FARTHEST_M:
+        raise InputError(f"the position in {where} lies beyond {FARTHEST_M / 1000:,.0f} km; it is in metres")
     try:
         stamp_ns = parse_seconds(words[0])
     except (ValueError, OverflowError):

@@ -297,7 +297,7 @@ def test_a_map_whose_points_no_image_saw_has_no_baseline(tmp_path: Path) -> None
     [
         ({"file": "none.png"}, "cannot read the photograph"),
         ({"file": "PHOTOS.json"}, "not a picture that can be decoded"),
-        ({"fx": 0}, "fx and fy positive"),
+        ({"fx": 0}, "fx and fy must be"),
         ({"fx": None}, "is not complete"),
         ({"distortion": [0, 0]}, "is not complete"),
         ({"T_cam_world": np.diag([1, 1, -1, 1]).tolist()}, "not a rotation"),

@@ -349,8 +349,9 @@ def test_settings_and_seed_change_the_session(tmp_path: Path) -> None:
     [
         ("moon", "avia", 1.0, {}, "no virtual world named 'moon'; there are: street"),
         ("street", "sonar", 1.0, {}, "no virtual LiDAR named 'sonar'; there are: avia"),
-        ("street", "avia", 0.01, {}, "give 0.1 or more"),
-        ("street", "avia", float("inf"), {}, "give 0.1 or more"),
+        ("street", "avia", 0.01, {}, "give 0.1 (one frame)"),
+        ("street", "avia", float("inf"), {}, "give 0.1 (one frame)"),
+        ("street", "avia", 1e300, {}, "give 0.1 (one frame)"),
         ("none.glb", "avia", 1.0, {}, "none.glb"),
         ("street", "avia", 1.0, {"returns": "4"}, "returns"),
         ("street", "avia", 1.0, {"motion": "no.tum,no.txt"}, "no.tum"),
@@ -368,6 +369,13 @@ def test_mistakes_are_told_in_one_sentence(
     assert message in str(told.value)
     assert "\n" not in str(told.value)
     assert not (tmp_path / "s").exists()
+
+
+def test_a_recording_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "session.mcap").write_bytes(b"recorded")
+    with pytest.raises(InputError, match="no simulation"):
+        sim.simulate("corridor", 0, 0.1, "avia", tmp_path)
+    assert [item.name for item in tmp_path.iterdir()] == ["session.mcap"]
 
 
 def test_every_setting_is_documented() -> None:

@@ -43,13 +43,16 @@ def run_calibrate(given: argparse.Namespace) -> int:
     from artemis_edge.calibrate.overlay import write_overlay
     from artemis_edge.calibrate.session import open_for_calibration
     from artemis_edge.devices.calibration import read_calibration, write_calibration
+    from artemis_edge.export.places import check_file
     from artemis_edge.progress import progress, say
 
+    overlay = given.overlay or given.out.with_suffix(".png")
+    check_file("--out", given.out, (".toml",), (given.poses,))
+    check_file("--overlay", overlay, (".png",), (given.out,))
     present = None if given.start is None else read_calibration(given.start)
     source, make = open_for_calibration(given.input, given.start, given.poses, given.no_poses)
     with progress("reading", given.json) as report:
         found = refine.refine(source, make, report)
-    overlay = given.overlay or given.out.with_suffix(".png")
     drawn = write_overlay(overlay, found.material, found.camera_fits)
     if found.changed:
         write_calibration(given.out, refine.to_calibration(found, source, present))

@@ -25,5 +25,5 @@ def json_option(parser: argparse.ArgumentParser) -> None:
 
 
 def print_json(value: Any) -> None:
-    """One object, on one line."""
-    print(json.dumps(value, ensure_ascii=False, allow_nan=False))
+    """One object, on one line, in ASCII: the same bytes whatever the terminal's encoding is."""
+    print(json.dumps(value, allow_nan=False))

@@ -137,10 +137,12 @@ def run_test(given: argparse.Namespace) -> int:
 
 def run_archive(given: argparse.Namespace) -> int:
     """``artemis-edge models archive``."""
+    from artemis_edge.export.places import check_file
     from artemis_edge.segmentation.oak import write_archive
     from artemis_edge.segmentation.registry import Registry
 
     entry = Registry().find(given.name)
+    check_file("--out", given.out, (".xz",), (given.compiled,))
     write_archive(given.out, entry.manifest, given.compiled or entry.folder / entry.manifest.file)
     return DONE
 

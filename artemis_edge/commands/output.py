@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from artemis_edge.commands.common import DONE, command
-from artemis_edge.errors import InputError
 
 _FORMATS = ("ply", "glb", "obj", "laz", "colmap")  # formats.NAMES, without its imports
 
@@ -49,7 +48,14 @@ def add_export(commands: Any) -> None:
 def run_render(given: argparse.Namespace) -> int:
     """``artemis-edge render``."""
     from artemis_edge import render
+    from artemis_edge.export.places import check_file
+    from artemis_edge.export.ply import find_mesh
+    from artemis_edge.opened_map import map_folder
 
+    read = (find_mesh(given.map), map_folder(given.map))
+    check_file("--out", given.out, (".png",), read)
+    if given.depth is not None:
+        check_file("--depth", given.depth, (".npy",), (given.out, *read))
     render.run(
         given.map,
         given.pose,
@@ -66,10 +72,16 @@ def run_render(given: argparse.Namespace) -> int:
 def run_export(given: argparse.Namespace) -> int:
     """``artemis-edge export``."""
     from artemis_edge.export.formats import write
+    from artemis_edge.export.places import check_file, check_new_folder
+    from artemis_edge.export.ply import find_mesh
+    from artemis_edge.opened_map import map_folder
     from artemis_edge.progress import progress
 
-    if given.format != "colmap" and given.out.is_dir():
-        raise InputError(f"{given.out} is a folder; --out needs the name of a file")
+    read = (find_mesh(given.map), map_folder(given.map))
+    if given.format == "colmap":
+        check_new_folder("--out", given.out, read)
+    else:
+        check_file("--out", given.out, (f".{given.format}",), read)
     with progress(f"writing {given.format}") as report:
         write(given.map, given.format, given.out, given.textured, report, given.georeferenced)
     return DONE

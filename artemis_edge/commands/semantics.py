@@ -45,8 +45,11 @@ def run_ask(given: argparse.Namespace) -> int:
     """``artemis-edge ask``."""
     from artemis_edge import ask
     from artemis_edge.export.objects import objects_json
+    from artemis_edge.export.places import check_folder
     from artemis_edge.progress import progress
 
+    if given.meshes is not None:
+        check_folder("--meshes", given.meshes)
     with progress("looking", plain=given.json) as report:
         replies = ask.ask(given.map, given.text, given.model, report, given.meshes)
     if given.json:

@@ -123,6 +123,8 @@ def evaluate_mesh(
     reference, faces = reference[good_point], mesh.faces[good_face]
     if len(reference) == 0:
         raise InputError("the reference cloud has no points; give a cloud of the same scene")
+    if len(faces) == 0:
+        raise InputError("the mesh has no triangle with finite coordinates; export or map it again")
     if not thresholds or any(not _FINEST_TAU_M <= tau <= _COARSEST_TAU_M for tau in thresholds):
         raise InputError(
             f"a threshold must be a length from {_FINEST_TAU_M:g} to {_COARSEST_TAU_M:g} metres, "

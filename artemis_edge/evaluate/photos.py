@@ -13,10 +13,13 @@ import numpy as np
 
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, U8, CameraModel
-from artemis_edge.trajectory import inverse
+from artemis_edge.lens import CAMERA_RULE, is_camera
+from artemis_edge.trajectory import FARTHEST_M, inverse
 
 # A rotation printed with a few digits is orthonormal up to this.
 _ROTATION_TOLERANCE = 1e-3
+# A lens that leaves e^-10 of the light in its corners leaves none; far beyond it numbers overflow.
+_STEEPEST_FALLOFF = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +74,10 @@ def _photo(folder: Path, entry: Any, where: str) -> Photo:
         raise InputError(
             f"{where} is not complete; it needs file, fx, fy, cx, cy, distortion and T_cam_world"
         ) from None
-    numbers = np.array([fx, fy, cx, cy, k1, k2, p1, p2, k3, *falloff])
-    if not np.isfinite(numbers).all() or fx <= 0.0 or fy <= 0.0:
-        raise InputError(f"{where}: the camera's numbers must be finite, fx and fy positive")
+    if not np.isfinite([k1, k2, p1, p2, k3]).all() or not is_camera(fx, fy, cx, cy):
+        raise InputError(f"{where}: the distortion must be finite, and {CAMERA_RULE}")
+    if not all(abs(a) <= _STEEPEST_FALLOFF for a in falloff):
+        raise InputError(f"{where}: its falloff is no lens's; coefficients are at most {_STEEPEST_FALLOFF:g}")
     if not _is_pose(T_cam_world):
         raise InputError(f"{where}: T_cam_world is not a rotation and a translation as a 4 x 4 matrix")
     image = read_image(folder / file)
@@ -83,7 +87,7 @@ def _photo(folder: Path, entry: Any, where: str) -> Photo:
 
 
 def _is_pose(T: F64) -> bool:
-    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
+    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_M).all() or not np.allclose(T[3], [0, 0, 0, 1]):
         return False
     R = T[:3, :3]
     return bool(np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(R) > 0.0)

@@ -69,6 +69,9 @@ def evaluate_trajectory(estimate: Trajectory, reference: Trajectory) -> Trajecto
     Raises InputError when fewer than three poses pair.
     """
     i, j = pair_by_time(estimate.stamp_ns, reference.stamp_ns)
+    fewer, name = min((len(estimate), "estimate"), (len(reference), "reference"))
+    if fewer < _LEAST_PAIRS:
+        raise InputError(f"the {name} has {fewer} poses; at least {_LEAST_PAIRS} are needed to compare paths")
     if len(i) < _LEAST_PAIRS:
         raise InputError(
             f"only {len(i)} of {len(estimate)} poses have a reference pose within 10 ms; "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,19 +15,32 @@ from artemis_edge.errors import RunError
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Binary file to write to, which takes the place of ``path`` only when the block ends without an error.
 
-    Raises RunError naming the cause (full disk, no permission); an older file of that name is then untouched.
+    A device or pipe (``/dev/null``) is written to as it is. Raises RunError naming the cause (full disk, no
+    permission); an older file of that name is then untouched.
     """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        with _told(path), path.open("wb") as file:
+            yield file
+        return
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        with _told(path):
+            with part.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise RunError(disk_sentence(path, error)) from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def disk_sentence(place: Path, error: OSError) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 from artemis_edge.colouring import sees
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.evaluate.photos import Photo, count_photos, read_photos
+from artemis_edge.export.places import check_new_folder
 from artemis_edge.frames import F32, F64, I64, U8, CameraModel
 from artemis_edge.kept_images import INDEX
 from artemis_edge.kept_points import KeptPoints
@@ -62,8 +63,7 @@ def write_colmap(folder: Path, kept: KeptPoints, map_dir: Path, report: Report =
         raise InputError(
             f"{map_dir} keeps no images; map a recording with a camera and with keep.images above 0"
         )
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder} is there already; give --out a folder that is new or empty")
+    check_new_folder("--out", folder, (map_dir,))
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".colmap-", dir=folder.parent) as scratch:

@@ -24,7 +24,7 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.atlas import UNTEXTURED, Atlas
 from artemis_edge.export.atomic import replacing
 from artemis_edge.export.corners import shared_corners
-from artemis_edge.export.mesh import Mesh
+from artemis_edge.export.mesh import Mesh, require_finite
 from artemis_edge.frames import F32, F64, I32, U8
 from artemis_edge.progress import Report, silent
 
@@ -58,10 +58,7 @@ def write_glb(
 
     Raises InputError for coordinates that are not finite, RunError when the file cannot be written.
     """
-    if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.normals).all()):
-        raise InputError(
-            "the mesh has coordinates that are not finite; write it again with `artemis-edge reprocess`"
-        )
+    require_finite(mesh)
     page = np.full(len(mesh.faces), UNTEXTURED, np.int32) if atlas is None else atlas.page
     with replacing(path) as file, tempfile.TemporaryFile(dir=path.parent) as spool:
         document = _Document(spool)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from artemis_edge.errors import InputError
 from artemis_edge.frames import F32, F64, I32, U8, Bool
 
 _GREY = 128
@@ -68,6 +69,14 @@ def finite_rows(points: F32 | F64) -> Bool:
     """Which rows of (n, k) have only finite numbers, bool (n,)."""
     finite: Bool = np.logical_and.reduce(np.isfinite(points), axis=1)
     return finite
+
+
+def require_finite(mesh: Mesh) -> None:
+    """InputError for a mesh whose coordinates other programs could not open."""
+    if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.normals).all()):
+        raise InputError(
+            "the mesh has coordinates that are not finite; write it again with `artemis-edge reprocess`"
+        )
 
 
 def vertex_normals(vertices: F32, faces: I32) -> F32:

@@ -17,7 +17,7 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.atlas import UNTEXTURED, Atlas
 from artemis_edge.export.atomic import replacing, write_bytes
 from artemis_edge.export.corners import shared_corners
-from artemis_edge.export.mesh import Mesh
+from artemis_edge.export.mesh import Mesh, require_finite
 from artemis_edge.export.png import png_bytes
 from artemis_edge.progress import Report, silent
 
@@ -34,10 +34,12 @@ def write_obj(
 ) -> None:
     """Write ``mesh`` and, with an atlas, the material file and pictures beside it; ``remarks`` as comments.
 
-    Raises InputError for a name that a material cannot bear, RunError when a file cannot be written.
+    Raises InputError for a name that a material cannot bear and for coordinates that are not finite, RunError when
+    a file cannot be written.
     """
     if any(character.isspace() for character in path.name):
         raise InputError(f"'{path.name}': an OBJ cannot name its materials with blanks; choose another --out")
+    require_finite(mesh)
     numbers = [] if atlas is None else np.unique(atlas.page[atlas.page != UNTEXTURED]).tolist()
     pictures = {number: f"{path.stem}_{number:03d}.png" for number in numbers}
     if atlas is not None:

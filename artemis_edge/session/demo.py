@@ -19,7 +19,7 @@ from artemis_edge.progress import Report, progress, say
 from artemis_edge.runtime import MakeMapper, Outcome, Request, pipeline, reprocess
 from artemis_edge.session.compile_demo import compiling
 from artemis_edge.session.report import Evaluation
-from artemis_edge.session.results import prepare
+from artemis_edge.session.results import preparing
 from artemis_edge.session.simulate import simulate
 from artemis_edge.session.truth import evaluate_against_world, read_moving, read_reference
 from artemis_edge.trajectory import inverse, read_tum
@@ -47,12 +47,10 @@ def demo(
     queries: Sequence[str] = QUERIES,
 ) -> str:
     """Write session and results to ``out``; returns what to print. Raises UserError as its parts do."""
-    prepare(out)
     session = out / SESSION
-    prepare(session)
     request = Request(session, out, own_odometry=True, queries=tuple(queries))
     say(f"recording a walk of {seconds:g} s through the virtual world '{world}'")
-    with compiling(request), reporter("recording") as report:
+    with preparing(out), preparing(session), compiling(request), reporter("recording") as report:
         made = simulate(world, seed, seconds, "avia", session, _SETTINGS, report)
     for note in made.notes:
         say(f"note: {note}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -15,6 +16,12 @@ from artemis_edge.errors import InputError, RunError
 from artemis_edge.export.atomic import disk_sentence, write_bytes
 
 _T = TypeVar("_T")
+# What a run writes first, and what it would replace.
+_OURS = b"[voxel_map]"
+_NAMES = (
+    "config.toml", "map", "mesh.ply", "mesh.glb", "trajectory.tum", "objects.json", "report.json", "report.html",
+)  # fmt: skip
+_SCRATCH, _HOLD = ".scratch-", ".held"
 
 
 class Results:
@@ -92,11 +99,43 @@ def preparing(folder: Path) -> Iterator[None]:
         raise
 
 
+def refuse_foreign(folder: Path) -> None:
+    """InputError where ``folder`` holds files by the names of results that no run made: they would be replaced."""
+    config = folder / "config.toml"
+    if config.is_file() and _OURS in config.read_bytes():
+        return
+    there = [name for name in _NAMES if (folder / name).exists()]
+    if there:
+        raise InputError(
+            f"{folder} holds {there[0]}, which is not of a run and would be replaced; choose another --out"
+        )
+
+
 @contextmanager
 def scratch(folder: Path) -> Iterator[Path]:
-    """A hidden folder inside ``folder``, on the same disk, gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix=".scratch-", dir=folder, ignore_cleanup_errors=True) as name:
+    """A hidden folder inside ``folder``, on the same disk, gone afterwards; those of runs that were killed go, too."""
+    for left in folder.glob(f"{_SCRATCH}*"):
+        if not _held(left / _HOLD):
+            shutil.rmtree(left, ignore_errors=True)
+    with (
+        tempfile.TemporaryDirectory(prefix=_SCRATCH, dir=folder, ignore_cleanup_errors=True) as name,
+        (Path(name) / _HOLD).open("w") as hold,
+    ):
+        with suppress(OSError):  # a disk that knows no locks
+            fcntl.flock(hold, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield Path(name)
+
+
+def _held(hold: Path) -> bool:
+    """Whether a process that lives has its scratch folder locked."""
+    try:
+        with hold.open() as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
 
 
 def _replace_folder(path: Path, write: Callable[[Path], _T]) -> _T:

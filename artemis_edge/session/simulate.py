@@ -24,7 +24,8 @@ from artemis_edge.session.truth_files import Witness, write_truth
 from artemis_edge.session.writer import SessionWriter
 
 WORLDS, LIDAR_NAMES = tuple(worlds()), tuple(LIDARS)
-_LONG_WALK_S = 300.0
+_FILE = "session.mcap"
+_LONG_WALK_S, _LONGEST_S = 300.0, 86_400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +64,13 @@ def simulate(
     ``world_name`` is one of WORLDS or a .glb, .gltf or .obj file, ``lidar`` one of LIDAR_NAMES. Raises
     InputError for unknown names, settings or impossible lengths, RunError when the disk refuses.
     """
-    frames = round(seconds * 1e9 / FRAME_NS) if np.isfinite(seconds) else 0
-    if frames < 1:
-        raise InputError(f"--seconds {seconds:g} is less than one frame; give 0.1 or more")
+    if not FRAME_S <= seconds <= _LONGEST_S:
+        raise InputError(f"--seconds {seconds:g}: give {FRAME_S:g} (one frame) to {_LONGEST_S:,.0f} (a day)")
+    frames = round(seconds * 1e9 / FRAME_NS)
     rig = build_rig(world_name, seed, frames * FRAME_S, lidar, read_settings(settings or {}))
     truth = out / "truth"
+    if (out / _FILE).exists() and not truth.exists():
+        raise InputError(f"{out} holds a recording that is no simulation; choose another --out")
     truth.mkdir(parents=True, exist_ok=True)
     short = frames * FRAME_S <= _LONG_WALK_S
     s = rig.settings
@@ -75,7 +78,7 @@ def simulate(
         points = short if s.point_truth is None else s.point_truth
         writer = stack.enter_context(SessionWriter(truth / "points.mcap")) if points else None
         witness = Witness(short if s.reference is None else s.reference, writer)
-        counts = record(rig, frames, out / "session.mcap", witness.watch, progress)
+        counts = record(rig, frames, out / _FILE, witness.watch, progress)
     written = write_truth(rig, frames, truth, witness)
     return SimulationSummary(
         session=out,
