@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from artemis_edge.errors import InputError
-from artemis_edge.frames import F32, U8
+from artemis_edge.frames import F32, F64, U8
 from artemis_edge.segmentation import scores
 from artemis_edge.segmentation.backend import (
     BACKGROUND,
@@ -44,15 +44,25 @@ def probabilities(logits: Array) -> F32:
     return weight
 
 
-def without_frequency(probability: F32, shares: F32) -> F32:
-    """Probabilities (h, w, k), each divided by its class' share in ``shares`` (k,) to a power; sums stay as they are.
+def without_frequency(probability: F32, rows: Sequence[int], shares: F64) -> F32:
+    """Scores (h, w, 1 + r) of background and the classes ``rows`` from ``probability`` (C, h, w) of all, less what
+    each class owes to its frequency ``shares`` (C,); background, all other classes, has that of all of them together.
 
     Calibrated probabilities hold how frequent a class is. A map that adds up what many images say would count that
     once an image, and what is rare and small would be lost to what is behind it.
     """
-    out = probability * (np.maximum(shares, _RAREST) ** -_TAKEN_OUT).astype(np.float32)
-    total = np.maximum(out.sum(axis=2, keepdims=True), np.float32(1e-9))
-    balanced: F32 = out * (probability.sum(axis=2, keepdims=True) / total)
+    shares = np.maximum(shares, _RAREST)
+    factor = shares**-_TAKEN_OUT
+    rest = np.ones(len(shares), bool)
+    rest[rows] = False
+    if rest.any():
+        # what is rare in the background is as little lost to what is frequent there
+        together = shares[rest].sum()
+        factor[rest] *= together ** (1.0 - _TAKEN_OUT) / (shares[rest] * factor[rest]).sum()
+    weight = factor.astype(np.float32)
+    nothing = np.tensordot(weight[rest], probability[rest], 1)
+    score = np.stack([nothing, *(weight[row] * probability[row] for row in rows)], axis=2)
+    balanced: F32 = score / score.sum(axis=2, keepdims=True)
     return balanced
 
 
@@ -74,7 +84,7 @@ class Semantic:
         self._network = network
         self._manifest = manifest
         self._thresholds = thresholds
-        self._shares = np.array(manifest.shares, np.float32)
+        self._shares = np.array(manifest.shares)
         if len(self._shares) not in (0, len(self.classes)):
             raise InputError(f"the manifest of {self.name} names another number of shares than of classes")
         self._row = {canonical(label): k for k, label in reversed(list(enumerate(manifest.classes)))}
@@ -112,11 +122,11 @@ class Semantic:
     def _dense(self, view: _View, prompts: Sequence[Prompt]) -> DenseScores:
         """A layer a prompt; what is left of probability 1 is background."""
         rows = list(dict.fromkeys(self._row[prompt.text] for prompt in prompts))
-        nothing = 1.0 - view.probability[rows].sum(axis=0)
-        score = np.stack([nothing, *view.probability[rows]], axis=2)
         if len(self._shares):
-            wanted = self._shares[rows]
-            score = without_frequency(score, np.append(1.0 - wanted.sum(), wanted).astype(np.float32))
+            score = without_frequency(view.probability, rows, self._shares)
+        else:
+            nothing = 1.0 - view.probability[rows].sum(axis=0)
+            score = np.stack([nothing, *view.probability[rows]], axis=2)
         layers = [0, *(1 + rows.index(self._row[prompt.text]) for prompt in prompts)]
         slots = (BACKGROUND, *(prompt.slot for prompt in prompts))
         return DenseScores(slots, scores.quantised(score[:, :, layers]), view.grid)
