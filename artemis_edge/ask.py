@@ -21,7 +21,7 @@ from artemis_edge.export.ply import find_mesh, read_mesh, write_ply
 from artemis_edge.frames import F32
 from artemis_edge.highlight import Reply, answer, objects_of
 from artemis_edge.opened_map import map_folder
-from artemis_edge.progress import Report, silent
+from artemis_edge.progress import Report, say, silent
 from artemis_edge.questions import Questions, unanswered
 from artemis_edge.refinement.agreement import agreed
 from artemis_edge.refinement.semantics import labels_of, refine_rows
@@ -55,15 +55,25 @@ def ask(
         return unanswered(questions, "nothing in it can be looked for")
     backend = open_by_name(questions.model, questions.thresholds)
     brush = MeshBrush(mesh, questions.names, config.semantics, config.voxel_map.voxel_m / 4)
-    keyframes = read_keyframes(folder)
-    for keyframe, seen in segment_all(keyframes, backend, questions.prompts, report):
+    keyframes, refused = read_keyframes(folder), list[str]()
+    for keyframe, seen in segment_all(keyframes, backend, questions.prompts, report, refused.append):
         brush.refine(keyframe, seen)
+    _tell_refused(refused, len(keyframes))
     report(len(keyframes), len(keyframes), "telling objects apart")
     labelled, probability = brush.labelled()
     replies = answer(questions.asked, objects_of(labelled, probability))
     if meshes is not None:
         _write_meshes(meshes, labelled, replies)
     return replies
+
+
+def _tell_refused(refused: Sequence[str], count: int) -> None:
+    if count and len(refused) == count:
+        raise InputError(
+            f"none of the {count} photographs of the map can be looked at: {refused[0]}; map it again"
+        )
+    if refused:
+        say(f"note: {len(refused)} of {count} photographs could not be looked at; the first: {refused[0]}")
 
 
 def _config(folder: Path) -> Config:

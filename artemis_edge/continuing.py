@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from artemis_edge.config import Config, from_toml
+from artemis_edge.config import Config, load
 from artemis_edge.errors import InputError
 from artemis_edge.export.ply import read_mesh
 from artemis_edge.frames import F32, Odometry, SyncedFrame
@@ -63,12 +63,15 @@ class EarlierMap:
         )
 
     def _pages(self) -> Iterator[Page]:
+        blocks, found = self.root / MAP / BLOCKS, False
         try:
-            yield from read_pages(self.root / MAP / BLOCKS)
+            for page in read_pages(blocks):
+                found = True
+                yield page
+            if not found:
+                raise ValueError("no blocks of the mesh beside it")
         except ValueError as error:
-            raise InputError(
-                f"{self.root / MAP / BLOCKS} is damaged ({error}); make that map again"
-            ) from None
+            raise InputError(f"{blocks} is damaged ({error}); make that map again") from None
 
     def _photographs(self) -> Iterator[Waiting]:
         still = np.zeros(6)
@@ -89,7 +92,7 @@ def open_earlier(path: Path, config: Config) -> EarlierMap:
     settings = root / MAP / CONFIG
     voxel_m = config.voxel_map.voxel_m
     if settings.is_file():
-        theirs = from_toml(settings.read_text("utf-8")).voxel_map.voxel_m
+        theirs = load(settings).voxel_map.voxel_m
         if theirs != voxel_m:
             raise InputError(
                 f"{root} has voxels of {theirs:g} m, this run of {voxel_m:g} m; continue it with "

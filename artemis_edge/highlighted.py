@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from artemis_edge.errors import InputError
 from artemis_edge.export.ply import Mesh
 from artemis_edge.frames import F64, U8, Bool
+from artemis_edge.json_file import read_json
 from artemis_edge.segmentation.query import shown
 
 _OBJECTS = "objects.json"
@@ -42,7 +42,7 @@ def read_objects(map_path: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
     try:
-        objects = json.loads(path.read_text())["objects"]
+        objects = read_json(path)["objects"]
     except (OSError, ValueError, KeyError, TypeError):
         objects = None
     if not isinstance(objects, list) or not all(isinstance(o, dict) for o in objects):

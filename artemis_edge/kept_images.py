@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F64, CameraImage, CameraModel, Trajectory
+from artemis_edge.json_file import read_json
 from artemis_edge.session.photos import photo_entry, suffix_of
 from artemis_edge.trajectory import covered, interpolate, inverse
 
@@ -33,20 +35,24 @@ class ImageSpool:
         self._placed: dict[str, F64] = {}  # T_world_cam of images of a map made before, by file name
 
     def take_over(self, folder: Path) -> None:
-        """Begin with the images of a map made before."""
+        """Begin with the images of a map made before; InputError where their index is damaged."""
         index = folder / INDEX
-        entries = json.loads(index.read_text("utf-8"))["photos"] if index.is_file() else []
-        for entry in entries:
-            source = folder / str(entry["file"])
-            if not source.is_file():
-                continue
-            camera, _, number = source.stem.rpartition("_")
-            image = _image(camera, entry)
-            shutil.copyfile(source, self._folder / source.name)
-            self._offered[camera] = max(self._offered.get(camera, 0), int(number) + 1)
-            self._kept.append((int(number), source.name, image))
-            self._placed[source.name] = inverse(np.array(entry["T_cam_world"], np.float64))
+        try:
+            for entry in read_json(index)["photos"] if index.is_file() else []:
+                self._take(folder / str(entry["file"]), entry)
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{index} is damaged; make that map again") from None
         self._thin()
+
+    def _take(self, source: Path, entry: dict[str, Any]) -> None:
+        if not source.is_file():
+            return
+        camera, _, number = source.stem.rpartition("_")
+        image = _image(camera, entry)
+        shutil.copyfile(source, self._folder / source.name)
+        self._offered[camera] = max(self._offered.get(camera, 0), int(number) + 1)
+        self._kept.append((int(number), source.name, image))
+        self._placed[source.name] = inverse(np.array(entry["T_cam_world"], np.float64))
 
     def add(self, image: CameraImage) -> None:
         """Write the image, or leave it out."""

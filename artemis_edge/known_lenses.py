@@ -16,6 +16,7 @@ import numpy as np
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F64, CameraModel
+from artemis_edge.json_file import read_json
 
 FILE = "lenses.json"
 _DIGITS = 6
@@ -59,7 +60,7 @@ def known_falloff(folder: Path | None, camera: CameraModel) -> tuple[float, ...]
                 _apart(camera, *(float(entry[key]) for key in ("fx", "fy", "cx", "cy"))),
                 tuple(float(a) for a in entry["falloff"]),
             )
-            for entry in json.loads(path.read_text("utf-8"))["lenses"]
+            for entry in read_json(path)["lenses"]
         ]
     except (KeyError, TypeError, ValueError, OSError):
         raise InputError(f"{path} is damaged; make the map again") from None

@@ -255,6 +255,12 @@ def test_what_is_no_map_is_refused(walks: tuple[Path, Path, Path], tmp_path: Pat
     blocks.write_bytes(blocks.read_bytes()[:-3])
     with pytest.raises(InputError, match="is damaged"):
         list(open_earlier(session, Config())._pages())
+    blocks.write_bytes(b"")
+    with pytest.raises(InputError, match="no blocks of the mesh"):
+        list(open_earlier(session, Config())._pages())
+    (session / "result" / "map" / "config.toml").write_bytes(b"\xff")
+    with pytest.raises(InputError, match="not valid TOML"):
+        open_earlier(session, Config())
 
 
 def test_a_stream_is_recognised_and_then_mapped_from_its_beginning(

@@ -357,6 +357,21 @@ def test_images_that_cannot_be_used(
     assert all(not frame.images for frame in source.frames())
 
 
+def test_one_image_that_cannot_be_used_does_not_cost_the_others(tmp_path: Path) -> None:
+    records = [r for r in _drive() if r[0] != "/cam/image_raw/compressed"]
+    topic, stamp = "/cam/image_raw/compressed", 12 * MS
+    broken = (topic, CompressedImage(Header(stamp, "cam"), "jpeg", b""), stamp)
+    source = _open(tmp_path, [*records, broken, *[_image(k * 100 * MS + stamp) for k in (1, 2, 3)]])
+    assert sum(len(frame.images) for frame in source.frames()) == 4
+    assert source.warnings == []  # whoever looks at it says which one
+
+
+def test_a_clock_that_was_set_back_is_told(tmp_path: Path) -> None:
+    source = _open(tmp_path, [_cloud(k) for k in (20 * SECOND, 21 * SECOND, 3 * SECOND, 4 * SECOND)])
+    assert [frame.stamp_ns // SECOND for frame in source.frames()] == [3, 4, 20, 21]
+    assert ["/lidar/points go back once, by up to 18.0 s" in text for text in source.warnings] == [True]
+
+
 def test_every_imu_sample_belongs_to_one_frame(tmp_path: Path) -> None:
     records = [_cloud((k + 1) * 100 * MS) for k in range(3)] + [_imu(50 * MS + k * 7 * MS) for k in range(60)]
     frames = list(_open(tmp_path, records).frames())

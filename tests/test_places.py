@@ -10,6 +10,7 @@ from artemis_edge.cli import main
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.export.places import check_file, check_folder, check_new_folder
+from artemis_edge.json_file import read_json
 from artemis_edge.session.results import refuse_foreign, scratch
 
 
@@ -78,6 +79,13 @@ def test_scratch_of_a_killed_run_is_cleared_away(tmp_path: Path) -> None:
     with scratch(tmp_path) as first, scratch(tmp_path) as second:
         assert sorted(tmp_path.iterdir()) == sorted((first, second))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_json_that_is_none_is_a_value_error(tmp_path: Path) -> None:
+    for content in (b"", b"\xff", b"[" * 100_000):
+        (tmp_path / "a.json").write_bytes(content)
+        with pytest.raises(ValueError):
+            read_json(tmp_path / "a.json")
 
 
 def test_json_is_one_object_in_failure_too(capsys: pytest.CaptureFixture[str]) -> None:

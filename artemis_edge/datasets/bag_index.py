@@ -63,6 +63,10 @@ class Reference:
         return self.bag.fetch(self.where)
 
 
+# Messages may overtake each other by less.
+_SET_BACK_NS = 500_000_000
+
+
 @dataclass(slots=True)
 class Track:
     """The messages of one topic in order of their stamps; ``frame_id`` is that of the first."""
@@ -131,6 +135,19 @@ class BagIndex:
             self.warnings.append(f"{self.tree.broken} transforms are not rigid and left out")
         if count := self.lost.get("undecodable_messages"):
             self.warnings.append(f"{count} messages cannot be decoded and are left out")
+        for topic, track in (self.clouds | self.images | self.imus).items():
+            self._tell_steps_back(topic, track.stamp_ns())
+
+    def _tell_steps_back(self, topic: str, stamp_ns: I64) -> None:
+        """A clock that was set while recording: what follows lies among, or before, what was recorded earlier."""
+        steps = np.diff(stamp_ns)
+        count = np.count_nonzero(steps < -_SET_BACK_NS)
+        if count:
+            times = "once" if count == 1 else f"{count} times"
+            self.warnings.append(
+                f"the stamps of {topic} go back {times}, by up to {-steps.min() / 1e9:.1f} s: its clock was set while "
+                "recording; all is taken in order of the stamps"
+            )
 
     def _needed(self, connection: Connection) -> int:
         self.types[connection.topic] = connection.ros_type

@@ -258,11 +258,25 @@ def _leave_camera(index: BagIndex, track: Track, reason: str, why: str) -> None:
 
 
 def _image_fault(track: Track, model: CameraModel) -> tuple[str, str] | None:
-    """Reason and sentence why the first image is of no use with the model, None if it is."""
+    """Reason and sentence why none of some images from first to last is of use with the model, None if one is."""
+    some = np.unique(np.linspace(0, len(track.references) - 1, _TRIALS).astype(int)).tolist()
+    fault = None
+    for k in some:
+        of_this = _fault_of(track, k, model)
+        if of_this is None:
+            return None
+        fault = fault or of_this
+    return fault
+
+
+def _fault_of(track: Track, k: int, model: CameraModel) -> tuple[str, str] | None:
     try:
-        pixels = cv2.imdecode(np.frombuffer(_image(track, 0), np.uint8), cv2.IMREAD_UNCHANGED)
-    except (CdrError, cv2.error) as error:
+        encoded = _image(track, k)
+        pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED) if encoded else None
+    except CdrError as error:
         return "images_undecodable", f"its images cannot be decoded ({error})"
+    except cv2.error:
+        pixels = None
     if pixels is None:
         return "images_undecodable", "its images cannot be decoded"
     if pixels.shape[:2] != (model.height, model.width):

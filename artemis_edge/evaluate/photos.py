@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, U8, CameraModel
+from artemis_edge.json_file import read_json
 from artemis_edge.lens import CAMERA_RULE, is_camera
 from artemis_edge.trajectory import FARTHEST_M, inverse
 
@@ -52,10 +52,10 @@ def count_photos(path: Path) -> int:
 
 def _entries(path: Path) -> list[Any]:
     try:
-        content = json.loads(path.read_text())
+        content = read_json(path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except (ValueError, RecursionError):
+    except ValueError:
         raise InputError(f"{path} is not JSON; `reprocess --holdout N` writes PHOTOS.json") from None
     entries = content.get("photos") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:

@@ -11,6 +11,7 @@ from typing import Any
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.geo.place import Georeference, to_json
+from artemis_edge.json_file import read_json
 
 _BEGIN, _END = "<!-- georeference -->", "<!-- end of georeference -->"
 
@@ -31,7 +32,7 @@ def add_to_report(folder: Path, made: Georeference) -> None:
 def read_report(folder: Path) -> tuple[dict[str, Any], str]:
     """Values and page of an output directory's report; InputError if there is none to be added to."""
     try:
-        report = json.loads((folder / "report.json").read_text("utf-8"))
+        report = read_json(folder / "report.json")
         page = (folder / "report.html").read_text("utf-8")
     except (OSError, ValueError):
         report, page = None, ""

@@ -19,6 +19,7 @@ from artemis_edge.config import SegmentationConfig
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F64, U8, CameraImage, CameraModel
+from artemis_edge.json_file import read_json
 from artemis_edge.progress import Report, silent
 from artemis_edge.segmentation.backend import Backend, Prompt, Segmentation
 from artemis_edge.segmentation.trial import decode
@@ -174,7 +175,7 @@ def read_keyframes(map_folder: Path) -> list[Keyframe]:
     for index in (map_folder / FOLDER / INDEX, map_folder / _OTHER_INDEX):
         if index.is_file():
             try:
-                rows = json.loads(index.read_text("utf-8"))["photos"]
+                rows = read_json(index)["photos"]
                 found = [_keyframe(index.parent, row) for row in rows]
             except (ValueError, KeyError, TypeError, OSError) as error:
                 raise InputError(f"{index} cannot be read ({error}); map the recording again") from None

@@ -16,6 +16,7 @@ from typing import Generic, TypeVar
 from artemis_edge.errors import InputError, RunError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import CameraImage
+from artemis_edge.json_file import read_json
 from artemis_edge.segmentation.backend import Prompt, Segmentation
 from artemis_edge.segmentation.engine import Engine, Job, Result
 
@@ -245,7 +246,7 @@ def write_log(path: Path, log: Sequence[Handed]) -> None:
 def read_log(path: Path) -> list[Handed]:
     """Read a log; raises InputError where it is none."""
     try:
-        rows = json.loads(path.read_text("utf-8"))["masks"]
+        rows = read_json(path)["masks"]
         return [Handed(int(row["turn"]), str(row["camera"]), int(row["stamp_ns"])) for row in rows]
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None

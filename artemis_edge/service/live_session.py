@@ -26,6 +26,7 @@ from artemis_edge.service.settings import RunConfig
 from artemis_edge.session.asked import Asked
 from artemis_edge.session.messages import Mask
 from artemis_edge.session.recorder import RecorderTask
+from artemis_edge.session.results import clear_left, remove_empty
 from artemis_edge.session.verify import CONFIG_NAME
 
 RESULT = "result"
@@ -138,6 +139,8 @@ class LiveSession:
         if self.mapper is not None:
             self._kill_mapper(self.mapper)
             self.mapper = None
+            clear_left(self._out)
+            remove_empty([self._out])
             self.fault = (
                 self.fault or "the map was not saved; 'artemis-edge replay' makes it from the recording"
             )

@@ -94,7 +94,7 @@ class ServiceSettings(Struct, frozen=True, forbid_unknown_fields=True):
         str, Meta(description="Control socket; empty: artemis.sock in the runtime directory.")
     ] = ""
     socket_mode: Annotated[
-        str, Meta(description="Who may use it, octal file mode.", pattern="^[0-7]{3}$")
+        str, Meta(description="Who may use it, octal file mode; its owner always.", pattern="^[67][0-7]{2}$")
     ] = "660"
     record_at_start: Annotated[bool, Meta(description="Record as soon as the devices run.")] = True
     start_patience_s: Annotated[

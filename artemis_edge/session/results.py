@@ -114,9 +114,7 @@ def refuse_foreign(folder: Path) -> None:
 @contextmanager
 def scratch(folder: Path) -> Iterator[Path]:
     """A hidden folder inside ``folder``, on the same disk, gone afterwards; those of runs that were killed go, too."""
-    for left in folder.glob(f"{_SCRATCH}*"):
-        if not _held(left / _HOLD):
-            shutil.rmtree(left, ignore_errors=True)
+    clear_left(folder)
     with (
         tempfile.TemporaryDirectory(prefix=_SCRATCH, dir=folder, ignore_cleanup_errors=True) as name,
         (Path(name) / _HOLD).open("w") as hold,
@@ -124,6 +122,13 @@ def scratch(folder: Path) -> Iterator[Path]:
         with suppress(OSError):  # a disk that knows no locks
             fcntl.flock(hold, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield Path(name)
+
+
+def clear_left(folder: Path) -> None:
+    """Remove the scratch folders of processes that are no more."""
+    for left in folder.glob(f"{_SCRATCH}*"):
+        if not _held(left / _HOLD):
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _held(hold: Path) -> bool:

@@ -29,6 +29,7 @@ from artemis_drivers.virtual.true_view import TrueView, truth_images
 from artemis_edge.errors import InputError, UserError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F64
+from artemis_edge.json_file import read_json
 from artemis_edge.render import parse_pose
 from artemis_edge.session.photos import INDEX
 from artemis_edge.session.rig import FRAME_S, Rig, Settings, build_rig
@@ -118,7 +119,7 @@ def reopen(truth: Path) -> Rig:
     """The rig of a session, from its ``truth/world.json``; InputError when there is none that fits."""
     path = truth / "world.json"
     try:
-        said = json.loads(path.read_text("utf-8"))
+        said = read_json(path)
         settings = msgspec.convert(said["settings"], Settings)
         return build_rig(said["world"], said["seed"], said["seconds"], said["lidar"], settings)
     except (OSError, ValueError, KeyError, TypeError) as error:
