@@ -24,6 +24,7 @@ from artemis_edge.refinement.agreement import agreed
 from artemis_edge.refinement.semantics import LEAST_RELIABILITY, labels_of, refine
 from artemis_edge.segmentation.backend import DenseScores
 from artemis_edge.sight import (
+    DEPTH,
     Sight,
     Visibility,
     cell_px,
@@ -135,12 +136,14 @@ class SemanticMap:
 
     def fuse(self, mask: LateMask, stamp: int) -> int:
         """Voxel fusion (eq. 1) of a mask; returns how many vertices it sees."""
-        n = self._look(mask.sight)
-        if mask.sight.depth.size == 0:
-            # an image from before the question: what stood in its way is what the map knows now
-            lens, depth = mask.sight.lens, empty_depth(mask.sight.lens)
-            splat_depth(self._seen, n, lens[0], self._spacing_m, cell_px(lens), depth)
-            n = int(keep_visible(self._seen, n, cell_px(lens), depth, visibility(self.config)))
+        n, lens, then = self._look(mask.sight), mask.sight.lens, mask.sight.depth
+        # where the map knew nothing when the image was taken, what stood in the way is what it knows now
+        depth = empty_depth(lens)
+        splat_depth(self._seen, n, lens[0], self._spacing_m, cell_px(lens), depth)
+        if then.size > 0:
+            known = then[:, :, DEPTH] < np.inf
+            depth[known] = then[known]
+        n = int(keep_visible(self._seen, n, cell_px(lens), depth, visibility(self.config)))
         sampled = self._rows(n, mask.scores)
         sample_scores(self._seen, n, mask.scores.score, grid_of(mask.scores), sampled)
         fuse(

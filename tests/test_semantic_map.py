@@ -179,22 +179,24 @@ def test_rows_without_an_image_start_from_their_voxel() -> None:
     assert (lam[1] == -1.0).all()
 
 
-def test_a_mask_reaches_the_vertices_it_shows_and_not_those_behind() -> None:
-    """A wall of vertices 2 m before the camera hides one 4 m away, which a mask must not label."""
+@pytest.mark.parametrize("known", [True, False])
+def test_a_mask_reaches_the_vertices_it_shows_and_not_those_behind(known: bool) -> None:
+    """A wall of vertices 2 m before the camera hides one 4 m away, which a mask must not label; be the wall known when
+    the image is taken, or found before its mask is there."""
     store = bs.allocate(1.0, LOG_CLASS + CLASSES)
+    brush = SemanticMap(SemanticsConfig(), store, VOXEL_M)
+    brush.ask(["car"])
+    image = _image(CameraModel(80, 64, 60.0, 60.0, 40.0, 32.0))
+    empty = brush.sight(image, np.eye(4))
     slots = {}
     for z in (2.0, 4.0):
         span = np.arange(-0.35, 0.4, 0.1) if z == 2.0 else [0.05]
         for x in span:
             for y in span:
                 slots[round(x, 2), round(y, 2), z] = _vertex(store, x, y, z)
-    brush = SemanticMap(SemanticsConfig(), store, VOXEL_M)
-    brush.ask(["car"])
-    camera = CameraModel(80, 64, 60.0, 60.0, 40.0, 32.0)
     scores = DenseScores((0, 1), np.zeros((8, 10, 2), np.uint8), Grid(0.125, 0.125, 0.0, 0.0))
     scores.score[:, :, 1] = 250
-    image = _image(camera)
-    mask = LateMask(brush.sight(image, np.eye(4)), scores)
+    mask = LateMask(brush.sight(image, np.eye(4)) if known else empty, scores)
     n = brush.fuse(mask, 1)
     assert brush.refine(mask, n, 1) == len(slots) - 1
     front, behind = slots[0.05, 0.05, 2.0], slots[0.05, 0.05, 4.0]
