@@ -95,3 +95,11 @@ def test_json_is_one_object_in_failure_too(capsys: pytest.CaptureFixture[str]) -
         found = json.loads(told.out)
         assert found["exit_code"] == 2
         assert found["error"] == told.err.strip().partition(": ")[2]
+
+
+@pytest.mark.parametrize("port", ["-1", "0", "65536", "80a"])
+def test_a_port_that_is_none_is_told_before_the_map_is_read(
+    port: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", "nowhere", f"--port={port}"]) == 2
+    assert f"'{port}' is no port" in capsys.readouterr().err

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from artemis_edge.status import QueryStatus
     from artemis_edge.view.live import LiveView
 
-_PORT = 8080
+_PORT, _LAST_PORT = 8080, 65_535
 
 
 def add(commands: Any) -> None:
@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
         "map", type=Path, nargs="?", metavar="MAP",
         help="an output directory or a mesh.ply; without: the map that the service makes",
     )  # fmt: skip
-    parser.add_argument("--port", type=int, default=_PORT, metavar="N", help=f"default: {_PORT}")
+    parser.add_argument("--port", type=_port, default=_PORT, metavar="N", help=f"default: {_PORT}")
     parser.add_argument(
         "--host", default="127.0.0.1", metavar="ADDRESS",
         help="listen for other machines, too, on this address; they need the token that is printed",
@@ -31,6 +31,12 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--live", type=Path, metavar="SOCKET", help="the map of a run with this view.socket instead"
     )
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= _LAST_PORT:
+        raise argparse.ArgumentTypeError(f"'{text}' is no port; give 1 to {_LAST_PORT}, for example {_PORT}")
+    return int(text)
 
 
 def run_view(given: argparse.Namespace) -> int:
