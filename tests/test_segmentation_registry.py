@@ -12,6 +12,7 @@ import pytest
 from artemis_edge.cli import main
 from artemis_edge.errors import InputError
 from artemis_edge.segmentation.manifest import Manifest, read_manifest
+from artemis_edge.segmentation.network import Network
 from artemis_edge.segmentation.registry import (
     STORE_VARIABLE,
     Addition,
@@ -121,6 +122,11 @@ def test_the_wrong_signature(registry: Registry, tmp_path: Path) -> None:
     assert "has 3 classes and 2 names were given" in refused(registry, model, classes=("a", "b"))
     assert "has 3 classes and 0 names were given" in refused(registry, model)
     assert "FastSAM has one" in refused(registry, model, kind="fastsam-clip")
+
+
+def test_tensors_larger_than_any_picture(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"tensor 'images' of 1 x 3 x 40000 x 40000, too large"):
+        Network(networks.semantic(tmp_path / "m.onnx", (40_000, 40_000)))
 
 
 def test_what_shows_only_when_it_runs(registry: Registry, tmp_path: Path) -> None:

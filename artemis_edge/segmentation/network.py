@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +20,8 @@ _DTYPES: dict[str, Any] = {
     "tensor(int64)": np.int64,
     "tensor(int32)": np.int32,
 }
+# Of one tensor: more than an image of 4096 x 4096 with sixteen channels fills the memory of small machines (1 GB).
+_MOST_VALUES = 16 * 4096 * 4096
 _OPSET = re.compile(r"[Oo]pset (\d+) is .*?till opset (\d+)", re.DOTALL)
 _IR = re.compile(r"Unsupported model IR version: (\d+), max supported IR version: (\d+)")
 _OPERATOR = re.compile(r"(?:No Op registered for (\w+)|Fatal error: ([\w.]+:\w+))")
@@ -47,6 +50,12 @@ class Network:
         self.file = path.name
         self.inputs = {node.name: _shape(node.shape) for node in self._session.get_inputs()}
         self.outputs = {node.name: _shape(node.shape) for node in self._session.get_outputs()}
+        for name, shape in (self.inputs | self.outputs).items():
+            if math.prod(side or 1 for side in shape) > _MOST_VALUES:
+                sides = " x ".join(str(side or "?") for side in shape)
+                raise InputError(
+                    f"{self.file} has the tensor '{name}' of {sides}, too large; export it smaller"
+                )
         self._dtypes = {node.name: _DTYPES.get(node.type) for node in self._session.get_inputs()}
         self.metadata: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
 
