@@ -15,7 +15,7 @@ from artemis_edge.evaluate.mesh import evaluate_mesh
 from artemis_edge.evaluate.trajectory import evaluate_trajectory
 from artemis_edge.export.ply import Mesh, bare_mesh
 from artemis_edge.frames import Trajectory
-from artemis_edge.session import charts, drawing, pictures
+from artemis_edge.session import charts, drawing, pictures, report_html
 from artemis_edge.session.report import Evaluation, RunStatistics, report_object, write_report
 from artemis_edge.trajectory import matrix_from_quaternion
 
@@ -223,3 +223,17 @@ def test_charts_hold_many_frames_and_outliers() -> None:
     ET.fromstring(many)
     assert charts.trajectory_chart(np.empty((0, 3))) == ""
     ET.fromstring(charts.stage_chart({"a & b": {"p50": 0.0, "p99": 0.0, "mean": 0.0}}))
+
+
+def test_answers_are_told_in_words() -> None:
+    found = {"text": "car", "status": "matched", "score": 0.917, "reason": "", "objects": [1, 2]}
+    absent = {
+        "text": "red tree",
+        "status": "not_found",
+        "score": 0.0,
+        "reason": "no tree is red",
+        "objects": [],
+    }
+    page = report_html._queries([found, absent])
+    assert "matched, 2 of them, the best with score 0.92" in page
+    assert "not found (no tree is red)" in page

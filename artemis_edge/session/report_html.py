@@ -232,11 +232,16 @@ def _warned(words: str, warn: bool) -> str:
 
 
 def _queries(queries: list[dict[str, Any]]) -> str:
-    rows = [
-        (str(q.get("text", "")), escape(", ".join(f"{k} {v}" for k, v in q.items() if k != "text")))
-        for q in queries
-    ]
+    rows = [(str(q.get("text", "")), _answer(q)) for q in queries]
     return f"<h2>Questions</h2>{_table(rows)}" if rows else ""
+
+
+def _answer(query: dict[str, Any]) -> str:
+    """As ``ask`` says it: the status, the best score and how many objects, and why."""
+    told = str(query.get("status", "")).replace("_", " ")
+    if found := query.get("objects"):
+        told += f", {len(found)} of them, the best with score {float(query.get('score', 0.0)):.2f}"
+    return told + (f" ({query['reason']})" if query.get("reason") else "")
 
 
 def _config(toml: str) -> str:
