@@ -173,21 +173,21 @@ class MesherConfig(Struct, frozen=True, forbid_unknown_fields=True):
         float, _float("Edges up to this many point spacings are surface.", ge=1.0, le=4.0)
     ] = 2.0
     long_edge: Annotated[
-        float,
-        _float("Edges up to this many point spacings are surface where seen well or flat.", ge=1.0, le=4.0),
+        float, _float("Edges up to this many point spacings are surface where well seen.", ge=1.0, le=4.0)
     ] = 4.0
-    well_seen: Annotated[
-        float,
-        _float("Evidence (hits at close range) of a vertex that carries a long edge.", ge=0.01, le=1000.0),
-    ] = 1.5
-    coplanar: Annotated[
+    least_hits: Annotated[
         float,
         _float(
-            "Or the cosine between a triangle's normal and its vertices' normals that does.", ge=0.0, le=1.1
+            "Hits of a triangle's corners (far ones count more) that carry a short edge, a longer one by its square.",
+            ge=0.0,
+            le=1000.0,
         ),
-    ] = 0.9
+    ] = 6.0
     agreement: Annotated[
-        float, _float("Least such cosine of any triangle; -1 accepts all.", ge=-1.0, le=1.0)
+        float,
+        _float(
+            "Least cosine between a triangle's normal and its vertices'; -1 accepts all.", ge=-1.0, le=1.0
+        ),
     ] = -1.0
     group_cosine: Annotated[
         float,
@@ -471,16 +471,28 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     semantics: SemanticsConfig = SemanticsConfig()
 
 
+# Settings of earlier versions, which their recordings and maps still carry
+_RETIRED = {"mesher": ("coplanar", "well_seen")}
+
+
+def _without_retired(tree: dict[str, Any]) -> dict[str, Any]:
+    kept = dict(tree)
+    for name, fields in _RETIRED.items():
+        if isinstance(section := tree.get(name), dict):
+            kept[name] = {field: value for field, value in section.items() if field not in fields}
+    return kept
+
+
 def load(file: Path | None = None, profile: str | None = None, sets: Iterable[str] = ()) -> Config:
     """Effective configuration: defaults, then the profile, then the file, then ``section.field=value`` texts.
 
-    Raises InputError naming the field and what it accepts.
+    Retired settings of a file are passed over. Raises InputError naming the field and what it accepts.
     """
     tree: dict[str, Any] = {}
     if profile is not None:
         _merge(tree, _read_profile(profile))
     if file is not None:
-        _merge(tree, read_toml(file))
+        _merge(tree, _without_retired(read_toml(file)))
     for text in sets:
         _merge(tree, _parse_set(text))
     try:
@@ -495,9 +507,9 @@ def to_toml(config: Config) -> str:
 
 
 def from_toml(text: str) -> Config:
-    """Inverse of ``to_toml``; InputError for a text that is none."""
+    """Inverse of ``to_toml``, retired settings passed over; InputError for a text that is none."""
     try:
-        return msgspec.toml.decode(text, type=Config)
+        return msgspec.convert(_without_retired(tomllib.loads(text)), Config)
     except (msgspec.MsgspecError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"configuration: {error}; docs/tuning.md lists every field and its range") from None
 

@@ -1,12 +1,17 @@
-"""The last look at a whole mesh before it is written: small holes closed, whiskers trimmed, islands left out.
+"""The last look at a whole mesh before it is written: small holes closed, overlaps mended, whiskers trimmed, islands
+left out.
 
 Live, a voxel decides with what it and its neighbours know; what is left open between several voxels shows only in
-the whole. Nothing here moves a vertex, and no edge gets a third triangle.
+the whole. Where two voxels cut their common surface differently, a triangle may lie over others and no hole is seen:
+the loop of free edges around such an overlap runs the wrong way round. It is mended by taking out one triangle or
+two and closing what then is a hole (half of the short loops: docs/tuning.md). Nothing here moves a vertex, and no edge
+gets a third triangle.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -19,6 +24,7 @@ LONGEST_LOOP = 12  # edges of a hole that is closed: about as wide as the longes
 # Rounds of closing and trimming: what trimming opens, the next round sees. Trimming whiskers further costs thin
 # things more recall than it saves open edges (docs/tuning.md)
 ROUNDS = 2
+ROOM = LONGEST_LOOP + 1  # corners of a loop that has got one more
 _SHIFT = 32
 
 
@@ -30,20 +36,10 @@ def finish(
     ``klass`` int32 (n,) are classes that vertices clearly have, -1 where none: nothing is closed between two.
     """
     for _ in range(ROUNDS):
-        faces = _closed(vertices, normals, faces, longest_m, klass)
+        faces = close_loops(vertices, normals, faces, longest_m, klass)
         faces = faces[free_edges(faces).sum(axis=1) < 2]
-    faces = _closed(vertices, normals, faces, longest_m, klass)
+    faces = close_loops(vertices, normals, faces, longest_m, klass)
     return faces[large_islands(faces, smallest_island)]
-
-
-def _closed(vertices: F32, normals: F32, faces: I32, longest_m: float, klass: I32 | None) -> I32:
-    closed = close_loops(vertices, normals, faces, longest_m)
-    if klass is None:
-        return closed
-    corner = klass[closed[len(faces) :]]
-    most = corner.max(axis=1, initial=-1)
-    one = ((corner == most[:, None]) | (corner < 0)).all(axis=1)
-    return np.concatenate((faces, closed[len(faces) :][one]))
 
 
 def _half_edges(faces: I32) -> I64:
@@ -67,23 +63,83 @@ def free_edges(faces: I32) -> Bool:
     return ~_twins(_half_edges(faces).ravel())[1].reshape(3, -1).T
 
 
-def close_loops(vertices: F32, normals: F32, faces: I32, longest_m: float) -> I32:
-    """Faces with every hole of at most ``LONGEST_LOOP`` edges filled whose diagonals are below ``longest_m``.
+class Loops(NamedTuple):
+    """The free edges of a mesh, sorted by ``start``, and scratch for one loop of them."""
+
+    start: I64  # (n,)
+    end: I64
+    owner: I64  # (n,) triangle on the other side of each
+    used: U8  # (n,)
+    ranked: I64  # all directed edges of the mesh, sorted
+    loop: I64  # (ROOM,) corners
+    edge: I64  # (ROOM,) places in ``start``
+    trial: I64  # (ROOM,) corners of a loop that is cut up
+    part: I32  # (ROOM, 3) what it was cut into
+    least: I32  # (ROOM, 3) the best of several cuts
+
+
+class Fills(NamedTuple):
+    """What closes loops: the triangles of each and those that are taken out for it."""
+
+    fill: I32  # (m, 3)
+    loop: I64  # (m,) the loop that a triangle belongs to
+    taken: I64  # (n, 2) triangles of the mesh that loop n gives up, -1 for none
+
+
+def close_loops(vertices: F32, normals: F32, faces: I32, longest_m: float, klass: I32 | None = None) -> I32:
+    """Faces with every loop of at most ``LONGEST_LOOP`` edges closed whose diagonals are below ``longest_m``.
 
     A fill must face as its vertices do: the rim of a small island is a loop too, but its inside is the back.
+    With ``klass`` nothing is closed between two.
     """
     keys = _half_edges(faces)
     free = free_edges(faces).T
     # a hole runs against the triangles around it
     start, end = keys[free] & 0xFFFFFFFF, keys[free] >> _SHIFT
+    owner = np.broadcast_to(np.arange(len(faces)), keys.shape)[free]
     order = np.lexsort((end, start))
-    start, end = start[order], end[order]
-    ranked = np.sort(keys.ravel())
-    fill = np.empty((len(start) + LONGEST_LOOP, 3), np.int32)
-    used = np.zeros(len(start), np.uint8)
-    loop, edge = np.empty(LONGEST_LOOP, np.int64), np.empty(LONGEST_LOOP, np.int64)
-    n = fill_loops(vertices, normals, start, end, ranked, longest_m, used, loop, edge, fill)
-    return np.concatenate((faces, _without_doubles(faces, fill[:n])))
+    n = len(start)
+    loops = Loops(
+        start=start[order],
+        end=end[order],
+        owner=owner[order],
+        used=np.zeros(n, np.uint8),
+        ranked=np.sort(keys.ravel()),
+        loop=np.empty(ROOM, np.int64),
+        edge=np.empty(ROOM, np.int64),
+        trial=np.empty(ROOM, np.int64),
+        part=np.empty((ROOM, 3), np.int32),
+        least=np.empty((ROOM, 3), np.int32),
+    )
+    room = 2 * n + ROOM
+    out = Fills(np.empty((room, 3), np.int32), np.empty(room, np.int64), np.empty((n, 2), np.int64))
+    fills, closed = fill_loops(vertices, normals, faces, longest_m, loops, out)
+    return _with_fills(faces, Fills(out.fill[:fills], out.loop[:fills], out.taken[:closed]), klass)
+
+
+def _with_fills(faces: I32, found: Fills, klass: I32 | None) -> I32:
+    """Faces with those loops closed that do not get into each other's way: none twice taken, no edge twice used."""
+    good = np.ones(len(found.taken), bool)
+    if klass is not None:
+        corner = klass[found.fill]
+        most = corner.max(axis=1, initial=-1)
+        good[found.loop[((corner != most[:, None]) & (corner >= 0)).any(axis=1)]] = False
+    wanted, which = found.taken.ravel(), np.repeat(np.arange(len(good)), 2)
+    wanted, which = wanted[wanted >= 0], which[wanted >= 0]
+    again = np.ones(len(wanted), bool)
+    again[np.unique(wanted, return_index=True)[1]] = False
+    good[which[again]] = False
+    mine = _half_edges(found.fill)
+    while True:
+        keep = np.ones(len(faces), bool)
+        keep[wanted[good[which]]] = False
+        chosen = good[found.loop]
+        keys = np.sort(np.concatenate((_half_edges(faces[keep]).ravel(), mine[:, chosen].ravel())))
+        twice = keys[1:][keys[1:] == keys[:-1]]
+        bad = np.isin(mine, twice).any(axis=0) & chosen
+        if not bad.any():
+            return np.concatenate((faces[keep], found.fill[chosen]))
+        good[found.loop[bad]] = False
 
 
 @kernel
@@ -136,10 +192,9 @@ def _next_edge(vertices: F32, normals: F32, start: I64, end: I64, used: U8, befo
 
 
 @kernel
-def _walk(
-    vertices: F32, normals: F32, start: I64, end: I64, used: U8, seed: int, loop: I64, edge: I64
-) -> int:
+def _walk(vertices: F32, normals: F32, w: Loops, seed: int) -> int:
     """Follow free edges from ``seed``; the loop's length when it closes within ``LONGEST_LOOP`` edges, else 0."""
+    start, end, loop, edge = w.start, w.end, w.loop, w.edge
     home = start[seed]
     loop[0], edge[0] = home, seed
     n = 1
@@ -150,7 +205,7 @@ def _walk(
                 return 0
         if n == LONGEST_LOOP:
             return 0
-        step = _next_edge(vertices, normals, start, end, used, loop[n - 1], at)
+        step = _next_edge(vertices, normals, start, end, w.used, loop[n - 1], at)
         if step < 0:
             return 0
         loop[n], edge[n] = at, step
@@ -181,11 +236,9 @@ def _faces_out(vertices: F32, normals: F32, a: int, b: int, c: int) -> bool:
 
 
 @kernel
-def _clip_ears(
-    vertices: F32, normals: F32, ranked: I64, longest_m: float, loop: I64, n: int, fill: I32, count: int
-) -> int:
-    """Triangulate a loop by its shortest diagonals; returns the new count, or the old one when it may not be."""
-    first = count
+def _clip_ears(vertices: F32, normals: F32, longest_m: float, w: Loops, n: int) -> int:
+    """Cut the first ``n`` corners of ``w.trial`` into ``w.part`` by the shortest diagonals; 0 when it may not be."""
+    loop, part, ranked, count = w.trial, w.part, w.ranked, 0
     while n > 3:
         best, best2 = -1, longest_m * longest_m
         for k in range(n):
@@ -194,51 +247,119 @@ def _clip_ears(
             if length2 <= best2 and not _has(ranked, (a << 32) | c) and not _has(ranked, (c << 32) | a):
                 best, best2 = k, length2
         if best < 0:
-            return first
+            return 0
         a, b, c = loop[best - 1 if best else n - 1], loop[best], loop[(best + 1) % n]
         if not _faces_out(vertices, normals, a, b, c):
-            return first
-        fill[count, 0], fill[count, 1], fill[count, 2] = a, b, c
+            return 0
+        part[count, 0], part[count, 1], part[count, 2] = a, b, c
         count += 1
         n -= 1
         for k in range(best, n):
             loop[k] = loop[k + 1]
     if not _faces_out(vertices, normals, loop[0], loop[1], loop[2]):
-        return first
-    fill[count, 0], fill[count, 1], fill[count, 2] = loop[0], loop[1], loop[2]
+        return 0
+    part[count, 0], part[count, 1], part[count, 2] = loop[0], loop[1], loop[2]
     return count + 1
 
 
 @kernel
-def fill_loops(
-    vertices: F32,
-    normals: F32,
-    start: I64,
-    end: I64,
-    ranked: I64,
-    longest_m: float,
-    used: U8,
-    loop: I64,
-    edge: I64,
-    fill: I32,
-) -> int:
-    """Walk the free edges (sorted by ``start``) and triangulate short loops; returns triangles in ``fill``.
+def _apex(faces: I32, w: Loops, n: int, k: int) -> int:
+    """The corner of the triangle beside the loop's edge ``k`` that is not on that edge."""
+    f = faces[w.owner[w.edge[k]]]
+    return np.int64(f[0]) + f[1] + f[2] - w.loop[k] - w.loop[(k + 1) % n]
 
-    ``ranked`` are all directed edges, sorted. ``loop`` and ``edge`` are scratch of LONGEST_LOOP.
+
+@kernel
+def _is_on(w: Loops, n: int, corner: int) -> bool:
+    for k in range(n):  # noqa: SIM110 (kernels know no any)
+        if w.loop[k] == corner:
+            return True
+    return False
+
+
+@kernel
+def _keep_shortest(vertices: F32, w: Loops, count: int, longest2: float) -> float:
+    """Keep the cut ``w.part`` in ``w.least`` when its longest edge is shorter than that of what was there."""
+    longest = 0.0
+    for i in range(count):
+        for k in range(3):
+            longest = max(longest, _length2(vertices, w.part[i, k], w.part[i, (k + 1) % 3]))
+    if longest >= longest2:
+        return longest2
+    _copy_rows(w.part, w.least, 0, count)
+    return longest
+
+
+@kernel
+def _copy_rows(source: I32, target: I32, first: int, count: int) -> None:
+    for i in range(count):
+        for k in range(3):
+            target[first + i, k] = source[i, k]
+
+
+@kernel
+def _mend(vertices: F32, normals: F32, faces: I32, longest_m: float, w: Loops, n: int, taken: I64) -> int:
+    """Close a loop around an overlap by taking out the triangle beside one edge, or the two beside a corner.
+
+    The two must share their third corner: then it takes the place of the one between them. Of all ways the one
+    with the shortest edges is kept in ``w.least``; returns its triangles, 0 when there is none.
     """
-    count = 0
-    for seed in range(start.shape[0]):
-        if used[seed]:
+    count, longest2 = 0, np.inf
+    for k in range(n):
+        apex = _apex(faces, w, n, k)
+        if _is_on(w, n, apex):
             continue
-        n = _walk(vertices, normals, start, end, used, seed, loop, edge)
+        after = (k + 1) % n
+        pair = _apex(faces, w, n, after) == apex and w.owner[w.edge[k]] != w.owner[w.edge[after]]
+        for both in range(2 if pair else 1):
+            _replace(w, n, k, apex, both == 1)
+            found = _clip_ears(vertices, normals, longest_m, w, n if both else n + 1)
+            if found == 0:
+                continue
+            shorter2 = _keep_shortest(vertices, w, found, longest2)
+            if shorter2 < longest2:
+                count, longest2 = found, shorter2
+                taken[0] = w.owner[w.edge[k]]
+                taken[1] = w.owner[w.edge[after]] if both else -1
+    return count
+
+
+@kernel
+def _replace(w: Loops, n: int, k: int, apex: int, both: bool) -> None:
+    """The loop into ``w.trial`` with ``apex`` after corner ``k``, or in the place of the corner after it."""
+    for i in range(n):
+        w.trial[i if i <= k or both else i + 1] = w.loop[i]
+    w.trial[(k + 1) % n if both else k + 1] = apex
+
+
+@kernel
+def fill_loops(
+    vertices: F32, normals: F32, faces: I32, longest_m: float, w: Loops, out: Fills
+) -> tuple[int, int]:
+    """Walk the free edges and cut up short loops; returns the triangles in ``out.fill`` and the loops closed."""
+    count = closed = 0
+    for seed in range(w.start.shape[0]):
+        if w.used[seed]:
+            continue
+        n = _walk(vertices, normals, w, seed)
+        for k in range(n):
+            w.used[w.edge[k]] = 1
         if n == 0:
             continue
-        filled = _clip_ears(vertices, normals, ranked, longest_m, loop, n, fill, count)
-        if filled > count:
-            count = filled
-            for k in range(n):
-                used[edge[k]] = 1
-    return count
+        for k in range(n):
+            w.trial[k] = w.loop[k]
+        out.taken[closed, 0] = out.taken[closed, 1] = -1
+        found = _clip_ears(vertices, normals, longest_m, w, n)
+        if found > 0:
+            _copy_rows(w.part, out.fill, count, found)
+        else:
+            found = _mend(vertices, normals, faces, longest_m, w, n, out.taken[closed])
+            _copy_rows(w.least, out.fill, count, found)
+        for i in range(found):
+            out.loop[count + i] = closed
+        count += found
+        closed += found > 0
+    return count, closed
 
 
 def large_islands(faces: I32, least: int) -> Bool:
@@ -254,11 +375,3 @@ def large_islands(faces: I32, least: int) -> Bool:
     piece = connected_components(graph, directed=False)[1]
     keep: Bool = np.bincount(piece)[piece] >= least
     return keep
-
-
-def _without_doubles(faces: I32, fill: I32) -> I32:
-    """Fills whose directed edges are used by no other triangle: two holes may want the same diagonal."""
-    keys, mine = _half_edges(faces).ravel(), _half_edges(fill)
-    twice = np.sort(np.concatenate((keys, mine.ravel())))
-    twice = twice[1:][twice[1:] == twice[:-1]]
-    return fill[~np.isin(mine, twice).any(axis=0)]

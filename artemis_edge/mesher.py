@@ -24,6 +24,7 @@ from artemis_edge.block_store import (
     CHANGED,
     COUNT,
     FRESH,
+    HITS,
     LOG_CLASS,
     NORMAL,
     PATCH_AT,
@@ -32,13 +33,14 @@ from artemis_edge.block_store import (
     POSITION,
     QUEUE_LEN,
     QUEUED,
+    SEEN,
     WEIGHT,
     Store,
 )
 from artemis_edge.cell_code import CODES, code_voxel, gather_cells, neighbour_shift
 from artemis_edge.config import MesherConfig
 from artemis_edge.delaunay import delaunay
-from artemis_edge.frames import F64, I32, U8
+from artemis_edge.frames import F32, F64, I32, U8
 from artemis_edge.semantic_constraint import SemanticConstraint, confident_class
 from artemis_edge.voxel_map import AT_ONCE, RefreshRules, RefreshSpace, VoxelMap, refresh_space, refresh_voxel
 
@@ -59,10 +61,9 @@ class Rules(NamedTuple):
     """When three vertices are surface; lengths in metres."""
 
     short_edge_m: float  # always accepted up to this length
-    long_edge_m: float  # accepted up to this length between well-seen vertices
-    well_seen: float  # evidence that makes a vertex well seen
-    coplanar: float  # cosine between a triangle's normal and those of its vertices that makes up for evidence
-    agreement: float  # least such cosine for any triangle
+    long_edge_m: float  # accepted up to this length where well seen
+    least_hits: float  # hits of the three corners together that carry just more than a short edge
+    agreement: float  # least cosine between a triangle's normal and those of its vertices
     group_cosine: float  # vertices whose normal is nearer than this to the direction are meshed together
     confidence_rate: float  # lambda of eq. 7, for telling objects apart; 0: they are not told apart
 
@@ -80,7 +81,7 @@ class Workspace(NamedTuple):
     klass: I32  # (m,) class that the vertex certainly has, -1 where none
     position: F64  # (m, 3) relative to the voxel's corner
     normal: F64  # (m, 3)
-    evidence: F64  # (m,)
+    hits: F64  # (m,) points that hit the vertex' cell, as many as at close range
     edge: U8  # (m, m) directed edges in use
     edges: I32  # (e, 2) list of them
     order: I32  # (m,)
@@ -114,7 +115,7 @@ def workspace() -> Workspace:
         klass=np.empty(m, np.int32),
         position=np.empty((m, 3)),
         normal=np.empty((m, 3)),
-        evidence=np.empty(m),
+        hits=np.empty(m),
         edge=np.zeros((m, m), np.uint8),
         edges=np.empty((27 * MOST_TRIANGLES, 2), np.int32),
         order=np.empty(m, np.int32),
@@ -199,7 +200,7 @@ def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Worksp
             p[POSITION + 2] - z0,
         )
         w.normal[n, 0], w.normal[n, 1], w.normal[n, 2] = p[NORMAL], p[NORMAL + 1], p[NORMAL + 2]
-        w.evidence[n] = store.evidence[s, COUNT]
+        w.hits[n] = hits_close_by(store.evidence[s])
         w.grid[code] = n
         n += 1
     return n
@@ -465,29 +466,47 @@ def _edge2(position: F64, a: int, b: int) -> float:
 
 
 @kernel
+def hits_close_by(e: F32) -> float:
+    """Points that hit a cell of ``evidence`` row ``e``, divided by their mean weight 1 / (1 + (range / noise range)^2).
+
+    Beams lie the further apart the farther they reach: a surface that is hit once far away would be hit several
+    times close by.
+    """
+    return np.float64(e[HITS]) * e[HITS] / max(np.float64(e[COUNT]), 1e-6)
+
+
+@kernel
 def is_surface(a: int, b: int, c: int, rules: Rules, w: Workspace) -> bool:
-    """Whether a triangle is surface: its edges against its evidence, its normal against its vertices'."""
-    longest = max(_edge2(w.position, a, b), _edge2(w.position, b, c), _edge2(w.position, c, a))
-    if longest > rules.long_edge_m * rules.long_edge_m:
+    """Whether a triangle is surface: its longest edge against the hits of its corners.
+
+    The wider it is, the more beams would have met what lies between if it were open: so the hits that are asked for
+    grow with the square of the longest edge. Hits tell better than the evidence of single corners or than flatness
+    (docs/tuning.md).
+    """
+    longest2 = max(_edge2(w.position, a, b), _edge2(w.position, b, c), _edge2(w.position, c, a))
+    if longest2 > rules.long_edge_m * rules.long_edge_m:
         return False
+    wider = longest2 / (rules.short_edge_m * rules.short_edge_m)
+    if wider > 1.0 and w.hits[a] + w.hits[b] + w.hits[c] < rules.least_hits * wider:
+        return False
+    return _agreement(a, b, c, w) >= rules.agreement
+
+
+@kernel
+def _agreement(a: int, b: int, c: int, w: Workspace) -> float:
+    """Least cosine between a triangle's normal and those of its vertices; -2 for one without area."""
     p, q, r = w.position[a], w.position[b], w.position[c]
     ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     if length < 1e-12:
-        return False
+        return -2.0
     agreement = 1.0
     for i in (a, b, c):
         g = w.normal[i]
         agreement = min(agreement, (nx * g[0] + ny * g[1] + nz * g[2]) / length)
-    if agreement < rules.agreement:
-        return False
-    if longest > rules.short_edge_m * rules.short_edge_m:
-        least = min(w.evidence[a], w.evidence[b], w.evidence[c])
-        if least < rules.well_seen and agreement < rules.coplanar:
-            return False
-    return True
+    return agreement
 
 
 @kernel
@@ -697,8 +716,7 @@ class Mesher:
         self._rules = Rules(
             short_edge_m=config.short_edge * cell,
             long_edge_m=config.long_edge * cell,
-            well_seen=config.well_seen,
-            coplanar=config.coplanar,
+            least_hits=config.least_hits,
             agreement=config.agreement,
             group_cosine=config.group_cosine,
             confidence_rate=constraint.telling_apart if constraint is not None else 0.0,
@@ -717,6 +735,7 @@ class Mesher:
         n = choose_batch(self._map.store, stamp, self._schedule, False, self._batch)
         batch = self._by_block(self._batch[:n])
         self._make_ready(self._blocks(batch), stamp)
+        batch = self._still_there(batch)
         self._refresh(batch, stamp)
         self._mesh(batch, stamp)
         self._settle(batch, stamp)
@@ -735,7 +754,7 @@ class Mesher:
             for stage in (self._refresh, self._mesh, self._settle):
                 for part in parts:
                     self._make_ready(self._blocks(part), stamp)
-                    stage(part, stamp)
+                    stage(self._still_there(part), stamp)
 
     @property
     def waiting(self) -> int:
@@ -744,6 +763,14 @@ class Mesher:
 
     def _blocks(self, batch: I32) -> I32:
         return np.unique(self._map.store.voxel[batch, BLOCK])
+
+    def _still_there(self, batch: I32) -> I32:
+        """The voxels whose blocks did not go to disk after they were taken off the queue."""
+        store = self._map.store
+        block, inner = store.voxel[batch, BLOCK], store.voxel[batch, :3] & 7
+        at = (inner[:, 0] << 6) | (inner[:, 1] << 3) | inner[:, 2]
+        there: I32 = batch[(store.block[block, SEEN] >= 0) & (store.block_voxel[block, at] == batch)]
+        return there
 
     def _by_block(self, batch: I32) -> I32:
         """Block by block: voxels of a block share cells and neighbours, which are then in the cache."""

@@ -612,7 +612,7 @@ class Pager:
         """Have the neighbours of blocks in memory whose patches are about to change."""
         if len(self.file) > 0:
             self.make_room(stamp)
-            self.bring_back(blocks, stamp)
+            self.bring_back(blocks[self._store.block[blocks, SEEN] >= 0], stamp)  # not those that just went
 
     def _compact(self) -> None:
         """Move all patches together: rooms of the wrong size would else be free and of no use."""

@@ -1,13 +1,14 @@
 """Settings: every number has finite limits at both ends and nothing beyond them is taken."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 from msgspec.inspect import FloatType, IntType, Metadata, StructType, type_info
 
-from artemis_edge.config import Config, load, profiles, to_toml
+from artemis_edge.config import Config, from_toml, load, profiles, to_toml
 from artemis_edge.errors import InputError
 
 
@@ -71,3 +72,14 @@ def test_profiles_and_defaults_are_within_the_limits(profile: str | None) -> Non
     config = load(profile=profile)
     assert msgspec.convert(msgspec.to_builtins(config), Config) == config
     assert msgspec.toml.decode(to_toml(config), type=Config) == config
+
+
+def test_retired_settings_of_earlier_maps_are_passed_over_and_others_are_not(tmp_path: Path) -> None:
+    text = "[mesher]\ncoplanar = 0.9\nwell_seen = 1.5\nfresh = 5\n"
+    (tmp_path / "config.toml").write_text(text)
+    assert from_toml(text) == load(tmp_path / "config.toml") == load(sets=["mesher.fresh=5"])
+    for wrong in ("[mesher]\nnonsense = 1\n", "mesher = 3\n"):
+        with pytest.raises(InputError, match="configuration"):
+            from_toml(wrong)
+    with pytest.raises(InputError, match="coplanar"):
+        load(sets=["mesher.coplanar=0.9"])

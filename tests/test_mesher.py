@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from artemis_edge.block_store import COUNT, HITS
 from artemis_edge.config import MesherConfig, VoxelMapConfig
 from artemis_edge.evaluate.topology import topology
 from artemis_edge.export.mesh import Mesh
 from artemis_edge.frames import F64
 from artemis_edge.map_writer import gather_mesh
+from artemis_edge.mesher import Rules, hits_close_by, is_surface, workspace
 from tests import naive
 
 CELL_M = VoxelMapConfig().voxel_m / 4
@@ -263,3 +265,34 @@ def test_no_directed_edge_is_ever_used_twice(
     naive.assert_manifold(triangles)
     assert np.isfinite(mesh.vertices).all()
     assert set(triangles.ravel().tolist()) <= naive.living_vertices(mapper.pager).keys()
+
+
+def test_far_hits_count_as_many_as_the_beam_would_have_close_by() -> None:
+    row = np.zeros(16, np.float32)
+    assert hits_close_by(row) == 0.0
+    ranges_m = np.array([5.0, 20.0, 40.0])
+    weights = 1.0 / (1.0 + (ranges_m / VoxelMapConfig().noise_range_m) ** 2)
+    row[HITS], row[COUNT] = 3.0, weights.sum()
+    assert hits_close_by(row) == pytest.approx(3.0 / weights.mean(), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_long_edges_are_surface_where_the_corners_were_hit_often(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rules = Rules(0.2, 0.4, 4.0, 0.2 * (seed % 2) - 1.2 * (1 - seed % 2), 0.3, 0.0)
+    w = workspace()
+    w.position[:3] = rng.uniform(0.0, 0.32, (3, 3))
+    if seed >= 18:
+        w.position[2] = 2.0 * w.position[1] - w.position[0]  # collinear
+    w.normal[:3] = rng.normal(size=(3, 3))
+    w.normal[:3] /= np.linalg.norm(w.normal[:3], axis=1, keepdims=True)
+    w.hits[:3] = rng.uniform(0.0, 8.0, 3)
+    p = w.position[:3]
+    longest = np.linalg.norm(p - np.roll(p, 1, axis=0), axis=1).max()
+    normal = np.cross(p[1] - p[0], p[2] - p[0])
+    area2 = float(np.linalg.norm(normal))
+    facing = area2 > 1e-12 and (w.normal[:3] @ normal / area2).min() >= rules.agreement
+    carried = longest <= 0.2 or (longest <= 0.4 and w.hits[:3].sum() >= 4.0 * (longest / 0.2) ** 2)
+    assert is_surface(0, 1, 2, rules, w) == (
+        carried and (facing or (rules.agreement < -1.0 and area2 > 1e-12))
+    )
