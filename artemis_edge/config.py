@@ -125,6 +125,14 @@ class VoxelMapConfig(Struct, frozen=True, forbid_unknown_fields=True):
             le=100_000.0,
         ),
     ] = 20.0
+    degenerate_trust: Annotated[
+        float,
+        _float(
+            "Share that a point counts where its frame's scan leaves a direction of travel open.",
+            ge=0.05,
+            le=1.0,
+        ),
+    ] = 0.5
     plane_sigma_m: Annotated[
         float,
         _float("Thickness up to which points are one plane: ranging noise 1 sigma [m].", ge=0.0001, le=0.5),

@@ -42,6 +42,7 @@ class InsertRules(NamedTuple):
     min_range_m: float
     max_range_m: float
     noise_range_m: float
+    trust: float  # share that each point counts: less where the frame's place is not sure
 
 
 class Chunk(NamedTuple):
@@ -86,14 +87,14 @@ def insert_points(
     """Add points (n, 3) in the lidar frame to their cells; ``touched`` gets voxels first seen at ``stamp``.
 
     A point weighs 1 / (1 + (range / noise_range)^2): the inverse variance of a LiDAR whose error is a constant
-    in range plus a constant in angle, relative to its variance at close range. Returns the length of
+    in range plus a constant in angle, relative to its variance at close range; times ``trust``. Returns the length of
     ``touched``; points that find the pool full are left out (the caller makes room and is told by the counters).
     """
     for start in range(0, points.shape[0], CHUNK):
         part = points[start : start + CHUNK]
         _locate(part, T_world_lidar, origin, rules, w)
         n = _find_cells(store, part.shape[0], stamp, touched, n, w)
-        _accumulate(store, part.shape[0], w)
+        _accumulate(store, part.shape[0], np.float32(rules.trust), w)
     return n
 
 
@@ -125,9 +126,10 @@ def _weigh(x: F32, y: F32, z: F32, rules: InsertRules, weight: F32, weight_per_m
     """Weights of rays; 0 out of range and for what is no number."""
     nearest, farthest = np.float32(rules.min_range_m**2), np.float32(rules.max_range_m**2)
     k, one, none = np.float32(1.0 / rules.noise_range_m**2), np.float32(1.0), np.float32(0.0)
+    trust = np.float32(rules.trust)
     for i in range(x.shape[0]):
         square = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
-        of_range = one / (one + square * k)
+        of_range = trust / (one + square * k)
         weight[i] = of_range if (square >= nearest) & (square <= farthest) else none
         weight_per_m[i] = of_range / np.float32(math.sqrt(max(square, np.float32(1e-12))))
 
@@ -213,7 +215,7 @@ def _cell_at(store: Store, v: int, c: int) -> int:
 
 
 @kernel
-def _accumulate(store: Store, n_points: int, w: Chunk) -> None:
+def _accumulate(store: Store, n_points: int, trust: np.float32, w: Chunk) -> None:
     """Add the moments of the points about their cells' centres."""
     for i in range(n_points):
         s = w.slot[i]
@@ -224,7 +226,7 @@ def _accumulate(store: Store, n_points: int, w: Chunk) -> None:
             store.voxel[w.voxel[i], PENDING] += 1
         k, x, y, z = w.weight[i], w.offset[0, i], w.offset[1, i], w.offset[2, i]
         kx, ky, kz = k * x, k * y, k * z
-        e[HITS] += 1.0
+        e[HITS] += trust
         # COUNT, SUM, SQUARE and VIEW, read before they are written: then the compiler adds eight at a time
         e0, e1, e2, e3, e4, e5, e6 = (
             e[0] + k,

@@ -197,7 +197,9 @@ class MappingRun:
         except (RunError, OSError) as error:
             self._stop(_sentence(error), self._span.stop - frame.index)
             return None
-        self._statistics.add_frame(wall / _NS_PER_MS, cpu / _NS_PER_MS, self._mapper.stage_ms)
+        self._statistics.add_frame(
+            wall / _NS_PER_MS, cpu / _NS_PER_MS, self._mapper.stage_ms, self._mapper.tracked
+        )
         self._statistics.add_lost(frame.lost)
         self._publish(delta)
         return None

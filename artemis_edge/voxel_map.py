@@ -77,15 +77,18 @@ class VoxelMap:
         self.store = bs.allocate(budget_bytes, attributes)
         self._touched = np.empty(self.store.voxel.shape[0], np.int32)
         self._insert_rules = InsertRules(
-            self.cell_m, config.min_range_m, config.max_range_m, config.noise_range_m
+            self.cell_m, config.min_range_m, config.max_range_m, config.noise_range_m, 1.0
         )
+        self._doubted = self._insert_rules._replace(trust=config.degenerate_trust)
         self._chunk = new_chunk()
 
     def insert(self, frame: TrackedFrame, stamp: int) -> I32:
         """Allocate the points of a frame; returns the slots of the voxels that received points.
 
-        ``stamp`` counts frames from 1. ``touched_blocks`` tells the blocks afterwards.
+        ``stamp`` counts frames from 1. ``touched_blocks`` tells the blocks afterwards. The points of a frame that is
+        marked ``degenerate`` count less.
         """
+        rules = self._doubted if frame.degenerate else self._insert_rules
         self.store.counter[TOUCHED_BLOCKS] = 0
         n = 0
         for scan in frame.scans:
@@ -94,7 +97,7 @@ class VoxelMap:
                 scan.points,
                 frame.T_world_lidar,
                 scan.origin,
-                self._insert_rules,
+                rules,
                 stamp,
                 self._touched,
                 n,

@@ -14,7 +14,7 @@ from artemis_edge.errors import RunError
 from artemis_edge.evaluate.mesh import evaluate_mesh
 from artemis_edge.evaluate.trajectory import evaluate_trajectory
 from artemis_edge.export.ply import Mesh, bare_mesh
-from artemis_edge.frames import Trajectory
+from artemis_edge.frames import TrackedFrame, Trajectory
 from artemis_edge.session import charts, drawing, pictures, report_html
 from artemis_edge.session.report import Evaluation, RunStatistics, report_object, write_report
 from artemis_edge.trajectory import matrix_from_quaternion
@@ -53,7 +53,8 @@ def walk(count: int = 30) -> Trajectory:
 def statistics(frames: int = 30) -> RunStatistics:
     run = RunStatistics(input_name="walk <1>", input_hz=10.0, warmup_s=0.5, map_bytes=1234, peak_rss_mb=321.0)
     for k in range(frames):
-        run.add_frame(20.0 + k, 15.0, {"odometry": 5.0, "mesher": 10.0 + k})
+        tracked = TrackedFrame(k, 0, np.eye(4), (), degenerate=k < 2)
+        run.add_frame(20.0 + k, 15.0, {"odometry": 5.0, "mesher": 10.0 + k}, tracked)
     run.add_lost({"nan_points": 3})
     run.add_lost({"nan_points": 2, "packets": 0})
     run.config_toml = "[mesher]\nname = 'a < b & c'\n"
@@ -69,6 +70,7 @@ def test_report_has_every_key_of_the_contract(tmp_path: Path) -> None:
     assert report == returned
     assert set(report) >= CONTRACT
     assert report["frames"] == 30 and report["frames_dropped"] == 0
+    assert report["frames_degenerate"] == 2
     assert report["frame_ms"]["mean"] == pytest.approx(34.5) and report["frame_ms"]["max"] == 49.0
     assert report["frame_ms"]["p50"] == pytest.approx(34.5) and report["frame_ms"]["p99"] > 48
     assert report["cpu_ms"]["mean"] == 15.0

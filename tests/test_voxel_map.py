@@ -65,10 +65,12 @@ def test_insertion_against_a_dictionary(seed: int) -> None:
         T, origin = _pose(rng, 30.0), rng.uniform(-0.5, 0.5, 3)
         points = rng.normal(0.0, rng.choice([1.0, 2.0, 3.0]), (600, 3)).astype(np.float32)
         scan = DeskewedScan(points, origin)
-        touched = voxel_map.insert(TrackedFrame(0, 0, T, (scan,)), stamp)
+        degenerate = stamp == 2
+        touched = voxel_map.insert(TrackedFrame(0, 0, T, (scan,), degenerate), stamp)
         new = _naive(scan, T)
+        trust = CONFIG.degenerate_trust if degenerate else 1.0
         for cell, row in new.items():
-            twin[cell] = twin.get(cell, np.zeros(SUMS)) + row
+            twin[cell] = twin.get(cell, np.zeros(SUMS)) + trust * row
         voxels = {tuple(c >> 2 for c in cell) for cell in new}
         assert len(touched) == len(voxels)
         assert {tuple(v) for v in voxel_map.store.voxel[touched, :3].tolist()} == voxels

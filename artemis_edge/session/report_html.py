@@ -206,12 +206,16 @@ def _run_table(report: dict[str, Any]) -> str:
     lost = ", ".join(
         f"{count:,} {reason.replace('_', ' ')}" for reason, count in report["lost"].items() if count
     )
-    dropped = report["frames_dropped"]
+    dropped, open_ways = report["frames_dropped"], report["frames_degenerate"]
     frame, rate = report["frame_ms"], report["input_hz"]
     return _table(
         [
             ("Input", escape(report["input"] or "unnamed") + (f", {rate:g} Hz" if rate else "")),
             ("Frames", f"{report['frames']} mapped, " + _warned(f"{dropped} dropped", dropped > 0)),
+            (
+                "Degenerate",
+                _warned(f"{open_ways} frames leave a direction open", True) if open_ways else "none",
+            ),
             ("Lost", _warned(escape(lost), True) if lost else "nothing"),
             ("Frame", ", ".join(f"{name} {value:.1f} ms" for name, value in frame.items())),
             ("CPU", f"{report['cpu_ms']['mean']:.1f} ms per frame on average"),

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from artemis_edge.frames import TrackedFrame
+
 _PACKAGES = ("artemis-edge", "numpy", "numba", "opencv-python-headless", "scipy")
 _DIGITS = 3  # of milliseconds
 
@@ -24,6 +26,7 @@ class RunStatistics:
     all threads that run the stages; ``stage_ms`` wall time by stage, in the order of the pipeline.
     ``flush_ms`` is the postponed work done once after the last frame, ``warmup_s`` what came before the first
     frame; neither is in ``frame_ms``, but ``flush_cpu_ms`` is part of the mean CPU time.
+    ``frames_degenerate`` are those whose scan left a direction of travel open.
     ``frames_dropped`` were in the input and are not in the map, ``lost`` says what and why, by
     reason. ``input_hz`` 0 when the input has no rate. ``peak_rss_mb`` is measured when the report is
     written unless it is set. ``continued`` says which map was continued and where in it, ``notes`` are sentences of
@@ -38,6 +41,7 @@ class RunStatistics:
     flush_ms: float = 0.0
     flush_cpu_ms: float = 0.0
     warmup_s: float = 0.0
+    frames_degenerate: int = 0
     frames_dropped: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     peak_rss_mb: float | None = None
@@ -47,8 +51,15 @@ class RunStatistics:
     continued: Mapping[str, Any] | None = None
     notes: list[str] = field(default_factory=list)
 
-    def add_frame(self, frame_ms: float, cpu_ms: float, stage_ms: Mapping[str, float]) -> None:
+    def add_frame(
+        self,
+        frame_ms: float,
+        cpu_ms: float,
+        stage_ms: Mapping[str, float],
+        tracked: TrackedFrame | None = None,
+    ) -> None:
         """One frame is done. A stage that did not run in every frame has fewer entries."""
+        self.frames_degenerate += tracked is not None and tracked.degenerate
         self.frame_ms.append(frame_ms)
         self.cpu_ms.append(cpu_ms)
         for name, spent in stage_ms.items():
@@ -66,6 +77,7 @@ class RunStatistics:
             "input": self.input_name,
             "frames": len(self.frame_ms),
             "frames_dropped": self.frames_dropped,
+            "frames_degenerate": self.frames_degenerate,
             "lost": dict(sorted(self.lost.items())),
             "frame_ms": _figures(self.frame_ms, ("p50", "p95", "p99", "mean", "max")),
             "cpu_ms": _figures(self.cpu_ms, ("p50", "mean")) | {"mean": self._cpu_mean_ms()},

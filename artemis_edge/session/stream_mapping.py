@@ -171,7 +171,9 @@ class StreamMapping:
         self.delta = self.mapper.process(frame)
         wall, cpu = time.perf_counter_ns() - wall, time.process_time_ns() - cpu
         self.size.add(self.delta)
-        self.statistics.add_frame(wall / _NS_PER_MS, cpu / _NS_PER_MS, self.mapper.stage_ms)
+        self.statistics.add_frame(
+            wall / _NS_PER_MS, cpu / _NS_PER_MS, self.mapper.stage_ms, self.mapper.tracked
+        )
         self.statistics.add_lost(frame.lost)
 
     def _drop(self, reason: str) -> None:
