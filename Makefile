@@ -85,7 +85,7 @@ train: $(READY)
 	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install -qq --only-binary :all: -e '.[dev,train]'
 	@$(BIN)/python training/views.py --out $(LEARNT)/learn --seeds 10000:10024 --views 20
 	@$(BIN)/python training/views.py --out $(LEARNT)/calibrate --seeds 20000:20001 --views 16
-	@$(BIN)/python training/views.py --out $(LEARNT)/judge --seeds 20001:20005 --views 16
+	@$(BIN)/python training/views.py --out $(LEARNT)/judge --seeds 20001:20005 --views 18
 	@$(BIN)/python training/train.py --views $(LEARNT)/learn --check $(LEARNT)/calibrate --out $(LEARNT)/weights.pt
 	@$(BIN)/python training/export.py --weights $(LEARNT)/weights.pt --calibrate $(LEARNT)/calibrate \
 	  --out artemis_edge/segmentation/shipped

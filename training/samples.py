@@ -14,7 +14,7 @@ U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 Rng = np.random.Generator
 
-INPUT = (480, 384)  # width, height that whole views are scaled to for the network
+INPUT = (640, 512)  # width, height that whole views are scaled to for the network
 CROP = (288, 224)
 _SCALE = (0.75, 1.2)  # of the views, whose crops these are
 _SOUGHT_SCALE = (0.75, 1.25)  # of crops that look for a class

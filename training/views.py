@@ -3,8 +3,8 @@
     python training/views.py --out VIEWS [--worlds NAME...] [--seeds A:B] [--views N]
 
 One file ``WORLD-SEED.npz`` a world: ``photo`` uint8 (n, h, w, 3) RGB and ``label`` uint8 (n, h, w), indices of
-``CLASS_NAMES``. They are photographs of the virtual rig's camera with all its faults. Half of them are taken on
-the walk, half look at a thing of a class drawn by ``_SOUGHT``, from the same walk. Equal arguments, equal bytes.
+``CLASS_NAMES``. They are photographs of the virtual rig's camera with all its faults. Two thirds of them are taken on
+the walk, the others look at a thing of a class drawn by ``_SOUGHT``, from the same walk. Equal arguments, equal bytes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 Rng = np.random.Generator
 
-WIDTH = 480  # pixels; the network's input
+WIDTH = 640  # pixels; the network's input
 WALK_S = 45.0
 #: How often views look for a class, relative to each other; the walk itself shows enough of the others.
 _SOUGHT = {
@@ -56,7 +56,7 @@ def render(world: str, seed: int, count: int) -> tuple[U8, U8]:
     for _ in range(count * _TRIES):
         if len(photos) == count:
             break
-        taken = _view(rig, camera, rng, sought=len(photos) % 2 == 1)
+        taken = _view(rig, camera, rng, sought=len(photos) % 3 == 2)
         if taken is not None:
             photos.append(taken[0])
             labels.append(taken[1])
