@@ -211,6 +211,12 @@ def recording_disk(service: ServiceSettings, rate_mb_s: float) -> list[Finding]:
     text = f"{minutes:.0f} minutes at {rate_mb_s:.0f} MB/s, {service.reserve_mb} MB kept free"
     space: Status = "fail" if minutes < _TOO_FEW_MINUTES else "warn" if minutes < _FEW_MINUTES else "ok"
     found = [Finding("disk space", space, text)]
+    if not folder.exists():
+        missing = (
+            f"{folder} is not there yet: the first recording makes it, in {place}; "
+            "if it is on a disk of its own, mount it"
+        )
+        found.append(Finding("sessions", "warn", missing))
     try:
         speed = write_speed(place)
     except OSError as error:

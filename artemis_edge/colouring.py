@@ -16,7 +16,7 @@ from artemis_edge.evaluate.photos import Photo, count_photos, read_photos
 from artemis_edge.frames import F32, F64, I64, U8, Bool, CameraModel
 from artemis_edge.kept_images import INDEX
 from artemis_edge.kept_points import KeptPoints, Rows, open_points
-from artemis_edge.progress import Report, silent
+from artemis_edge.progress import Report, say, silent
 from artemis_edge.splats import NOTHING, Lens, blank, lens_of, place, splat
 from artemis_edge.trajectory import inverse
 
@@ -74,10 +74,15 @@ def coloured_points(folder: Path, report: Report = silent) -> KeptPoints | None:
     points = np.concatenate([rows["position"] for rows in kept.chunks()])
     sums, seen = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.int64)
     total = count_photos(index)
-    for done, photo in enumerate(read_photos(index)):
+    for done, photo in enumerate(kept_photographs(index)):
         _add_photo(points, photo, sums, seen)
         report(done + 1, total, photo.file)
     return kept.with_colours(_coloured(kept.chunks(), sums, seen))
+
+
+def kept_photographs(index: Path) -> Iterator[Photo]:
+    """Those of a map's folder that can be read; what is said of the others ends up with whoever asked for them."""
+    return read_photos(index, lambda what: say(f"{what}; it goes on without it"))
 
 
 def _add_photo(points: F32, photo: Photo, sums: F32, seen: I64) -> None:

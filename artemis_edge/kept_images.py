@@ -17,6 +17,7 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F64, CameraImage, CameraModel, Trajectory
 from artemis_edge.json_file import read_json
+from artemis_edge.progress import say
 from artemis_edge.session.photos import photo_entry, suffix_of
 from artemis_edge.trajectory import covered, interpolate, inverse
 
@@ -38,21 +39,28 @@ class ImageSpool:
         """Begin with the images of a map made before; InputError where their index is damaged."""
         index = folder / INDEX
         try:
-            for entry in read_json(index)["photos"] if index.is_file() else []:
-                self._take(folder / str(entry["file"]), entry)
+            entries = read_json(index)["photos"] if index.is_file() else []
+            there = [self._take(folder / str(entry["file"]), entry) for entry in entries]
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{index} is damaged; make that map again") from None
+        if not all(there):
+            missing = len(there) - sum(there)
+            say(
+                f"{missing} of the {len(there)} photographs that {index} names are missing; it goes on without them"
+            )
         self._thin()
 
-    def _take(self, source: Path, entry: dict[str, Any]) -> None:
+    def _take(self, source: Path, entry: dict[str, Any]) -> bool:
+        """Whether the image is there."""
         if not source.is_file():
-            return
+            return False
         camera, _, number = source.stem.rpartition("_")
         image = _image(camera, entry)
         shutil.copyfile(source, self._folder / source.name)
         self._offered[camera] = max(self._offered.get(camera, 0), int(number) + 1)
         self._kept.append((int(number), source.name, image))
         self._placed[source.name] = inverse(np.array(entry["T_cam_world"], np.float64))
+        return True
 
     def add(self, image: CameraImage) -> None:
         """Write the image, or leave it out."""

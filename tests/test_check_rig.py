@@ -82,9 +82,11 @@ def test_the_disk_is_measured_and_counted_in_minutes(tmp_path: Path, monkeypatch
     service = ServiceSettings(sessions=str(tmp_path / "not" / "yet"))
     monkeypatch.setattr(check_rig, "write_speed", lambda folder: 25.0)
     monkeypatch.setattr(check_rig.health, "free_disk_mb", lambda folder: 1000 + 10 * 60 * 20.0)
-    space, speed = check_rig.recording_disk(service, 10.0)
+    space, place, speed = check_rig.recording_disk(service, 10.0)
+    assert place.status == "warn" and "is not there yet" in place.detail and str(tmp_path) in place.detail
     assert space.status == "warn" and space.detail.startswith("20 minutes")
     assert speed.status == "warn" and "25 MB/s" in speed.detail
+    (tmp_path / "not" / "yet").mkdir(parents=True)
     assert check_rig.recording_disk(service, 30.0)[1].status == "fail"
     assert check_rig.recording_disk(service, 5.0)[1].status == "ok"
 

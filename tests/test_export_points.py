@@ -144,6 +144,31 @@ def test_colmap_into_a_folder_with_something_is_refused(room: Path) -> None:
     assert (room / "empty" / "sparse" / "0" / "points3D.txt").is_file()
 
 
+def test_a_damaged_photograph_is_left_out_and_told(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pictures = sorted((room / "map" / "images").glob("*.png"))
+    pictures[0].write_bytes(pictures[0].read_bytes()[:40])
+    pictures[1].unlink()
+    assert main(["export", str(room), "--format", "colmap", "--out", str(room / "out")]) == 0
+    said = capsys.readouterr().err
+    assert pictures[0].name in said and pictures[1].name in said and "goes on without it" in said
+    assert [entry[2] for entry in naive_model(room / "out")[1].values()] == [
+        pictures[2].with_suffix(".jpg").name
+    ]
+    pictures[2].unlink()
+    assert main(["export", str(room), "--format", "colmap", "--out", str(room / "none")]) == 2
+    assert "none of the photographs" in capsys.readouterr().err and not (room / "none").exists()
+
+
+def test_missing_photographs_of_an_earlier_map_are_told(
+    room: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    next((room / "map" / "images").glob("*.png")).unlink()
+    (room / "next").mkdir()
+    ImageSpool(room / "next", 100).take_over(room / "map")
+    assert "1 of the 3 photographs" in capsys.readouterr().err
+    assert len(list((room / "next").iterdir())) == 2
+
+
 @pytest.mark.parametrize("name", ["laz", "colmap"])
 def test_without_points_the_sentence_says_what_to_do(
     room: Path, name: str, capsys: pytest.CaptureFixture[str]

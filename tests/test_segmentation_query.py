@@ -372,11 +372,18 @@ def test_a_full_table_takes_nothing() -> None:
         ("truck", [], Status.NOT_FOUND),
         ("giraffe", [], Status.UNSUPPORTED),
         ("car and person", [1, 2, 4, 5], Status.MATCHED),
+        ("car and truck", [1, 2], Status.APPROXIMATE),
     ],
 )
 def test_selection(text: str, expected: list[int], status: Status) -> None:
     found = ask(text)
     assert (sorted(hit.id for hit in found.hits), found.status) == (expected, status)
+
+
+def test_what_of_several_things_is_not_there_is_told() -> None:
+    assert ask("truck and car").reason == "no 'truck' was found"
+    assert ask("green car and tree").reason == "no 'car' of that kind was found"
+    assert ask("truck").reason == ""  # the status says it
 
 
 def test_who_looks_decides_left_and_right() -> None:

@@ -121,6 +121,7 @@ def test_the_wrong_signature(registry: Registry, tmp_path: Path) -> None:
     assert "is not a network of kind semantic" in refused(registry, model, kind="semantic", classes=("a",))
     assert "has 3 classes and 2 names were given" in refused(registry, model, classes=("a", "b"))
     assert "has 3 classes and 0 names were given" in refused(registry, model)
+    assert "names both class 0 and class 2" in refused(registry, model, classes=("a", "b", "a"))
     assert "FastSAM has one" in refused(registry, model, kind="fastsam-clip")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,10 @@ _ROTATION_TOLERANCE = 1e-3
 _STEEPEST_FALLOFF = 10.0
 
 
+class PictureError(InputError):
+    """A picture file that is missing or damaged."""
+
+
 @dataclass(frozen=True, slots=True)
 class Photo:
     """A photograph: ``image`` uint8 (h, w, 3) RGB, its camera, and ``T_world_cam`` (4, 4).
@@ -36,13 +40,19 @@ class Photo:
     falloff: tuple[float, ...] = ()
 
 
-def read_photos(path: Path) -> Iterator[Photo]:
+def read_photos(path: Path, unreadable: Callable[[str], None] | None = None) -> Iterator[Photo]:
     """The photographs of PHOTOS.json one by one; file names are relative to its folder.
 
-    Raises InputError for an index or a photograph that cannot be used.
+    Raises InputError for an index or a photograph that cannot be used. With ``unreadable`` a picture that is missing
+    or damaged is left out, and the sentence about it is handed over.
     """
     for number, entry in enumerate(_entries(path)):
-        yield _photo(path.parent, entry, f"photo {number} of {path}")
+        try:
+            yield _photo(path.parent, entry, f"photo {number} of {path}")
+        except PictureError as error:
+            if unreadable is None:
+                raise
+            unreadable(str(error))
 
 
 def count_photos(path: Path) -> int:
@@ -94,18 +104,18 @@ def _is_pose(T: F64) -> bool:
 
 
 def read_image(path: Path) -> U8:
-    """A picture file as RGB uint8 (h, w, 3); InputError if it cannot be read."""
+    """A picture file as RGB uint8 (h, w, 3); PictureError if it cannot be read."""
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot read the photograph {path}: {error.strerror}") from None
+        raise PictureError(f"cannot read the photograph {path}: {error.strerror}") from None
     return decoded(content, str(path))
 
 
 def decoded(content: bytes, name: str) -> U8:
-    """An encoded picture as RGB uint8 (h, w, 3); InputError naming it if it is none."""
+    """An encoded picture as RGB uint8 (h, w, 3); PictureError naming it if it is none."""
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     if image is None:
-        raise InputError(f"{name} is not a picture that can be decoded; take it out or copy it again")
+        raise PictureError(f"{name} is not a picture that can be decoded; take it out or copy it again")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

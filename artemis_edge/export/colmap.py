@@ -17,9 +17,9 @@ from typing import TextIO
 import cv2
 import numpy as np
 
-from artemis_edge.colouring import sees
+from artemis_edge.colouring import kept_photographs, sees
 from artemis_edge.errors import InputError, RunError
-from artemis_edge.evaluate.photos import Photo, count_photos, read_photos
+from artemis_edge.evaluate.photos import Photo, count_photos
 from artemis_edge.export.places import check_new_folder
 from artemis_edge.frames import F32, F64, I64, U8, CameraModel
 from artemis_edge.kept_images import INDEX
@@ -101,7 +101,7 @@ def _write_model(folder: Path, cloud: _Cloud, index: Path, report: Report) -> No
         file.write(
             "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID of each point it sees\n"
         )
-        for done, photo in enumerate(read_photos(index)):
+        for done, photo in enumerate(kept_photographs(index)):
             straight = undistorted(photo)
             number = cameras.setdefault(straight.camera, len(cameras) + 1)
             found = _observe(cloud, straight)
@@ -109,6 +109,8 @@ def _write_model(folder: Path, cloud: _Cloud, index: Path, report: Report) -> No
             _save(folder / "images" / straight.file, straight.image)
             tracks.append((found.point, done + 1))
             report(done + 1, total, straight.file)
+    if not tracks:
+        raise InputError(f"none of the photographs that {index} names can be read; map the recording again")
     _write_cameras(sparse / "cameras.txt", cameras)
     with (sparse / "points3D.txt").open("w") as file:
         _write_points(file, cloud, tracks)

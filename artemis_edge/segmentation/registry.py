@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import resources
@@ -153,6 +153,7 @@ class Registry:
         inside = names_in(network) if kind in ("yolo-seg", "semantic") else ()
         classes = wanted.classes or inside
         check_signature(network, kind, len(classes))
+        _check_names(classes)
         said = Manifest(
             name=name,
             kind=kind,
@@ -197,6 +198,15 @@ def _check_roles(kind: Kind, parts: Mapping[str, Path]) -> None:
         if role not in ROLES[kind]:
             takes = ", ".join(ROLES[kind]) or "none"
             raise InputError(f"--part {role}: a model of kind {kind} has no such part (it takes: {takes})")
+
+
+def _check_names(classes: Sequence[str]) -> None:
+    for k, name in enumerate(classes):
+        if name in classes[:k]:
+            raise InputError(
+                f"'{name}' names both class {classes.index(name)} and class {k} of the model; give each its own name "
+                "with --classes"
+            )
 
 
 def _fitting(name: str, entries: list[Entry]) -> str:

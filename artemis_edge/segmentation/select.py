@@ -251,9 +251,16 @@ def select(asked: Understanding, objects: Sequence[MapObject], viewpoint: F64 | 
         return Selection((), Status.UNSUPPORTED, asked.reason)
     search = _Search(objects, asked, viewpoint)
     best: dict[int, float] = {}
+    missed: list[str] = []
     for target in asked.query.targets:
-        for k, score in search.find(target).items():
+        found = search.find(target)
+        if not found and target.noun and asked.nouns[target.noun].classes:
+            kind = "" if target == Phrase(target.noun) else " of that kind"
+            missed.append(f"no '{target.noun}'{kind} was found")
+        for k, score in found.items():
             best[k] = max(score, best.get(k, 0.0))
+    if best:  # a part of the answer
+        search.left_out.update(dict.fromkeys(missed))
     reason = "; ".join([*([asked.reason] if asked.reason else []), *search.left_out])
     status = Status.APPROXIMATE if search.left_out else asked.status
     ranked = sorted(best, key=lambda k: (-best[k], k))
