@@ -53,7 +53,7 @@ def ask(
     questions = Questions.of(texts, model or config.segmentation.model, Thresholds.by(config.segmentation))
     if not questions.names:
         return unanswered(questions, "nothing in it can be looked for")
-    backend = open_by_name(questions.model, questions.thresholds)
+    backend = open_by_name(questions.model, questions.thresholds, fine=True)
     brush = MeshBrush(mesh, questions.names, config.semantics, config.voxel_map.voxel_m / 4)
     keyframes, refused = read_keyframes(folder), list[str]()
     for keyframe, seen in segment_all(keyframes, backend, questions.prompts, report, refused.append):

@@ -50,12 +50,13 @@ class Questions:
 
     def segmenter(self, schedule: Schedule, beside: bool = True) -> ScheduledMasks:
         """The network at work on a fixed schedule, so that equal input gives equal maps; ``beside`` the pipeline in
-        a process of its own, or here."""
+        a process of its own, or here. What is scheduled waits for its masks, so they are read finely."""
+        opener = partial(open_by_name, self.model, self.thresholds, fine=True)
         if beside:
-            engine = ProcessEngine(partial(open_by_name, self.model, self.thresholds))
+            engine = ProcessEngine(opener)
             engine.wait_until_ready()
             return ScheduledMasks(self.names, Scheduled(engine, self.prompts, schedule))
-        here = HereEngine(open_by_name(self.model, self.thresholds))
+        here = HereEngine(opener())
         return ScheduledMasks(self.names, Scheduled(here, self.prompts, schedule))
 
     def replies(self, mesh: Mesh, probability: F32) -> list[Reply]:

@@ -50,6 +50,46 @@ def semantic(folder: Path) -> Backend:
     return open_model(manifest("semantic", classes=classes, input_size=(120, 160), stride=8), folder)
 
 
+def test_large_images_are_read_at_the_fine_size_too_where_nobody_waits(tmp_path: Path) -> None:
+    networks.semantic(tmp_path / "model.onnx")
+    classes, stride = ("background", *networks.CLASSES), 8
+    coarse, fine = (
+        open_model(manifest("semantic", classes=classes, input_size=size, stride=stride), tmp_path)
+        for size in ((56, 72), (88, 120))
+    )
+    said = manifest(
+        "semantic", classes=classes, input_size=(56, 72), fine_input_size=(88, 120), stride=stride
+    )
+    live, both = open_model(said, tmp_path), open_model(said, tmp_path, fine=True)
+    image, prompts = networks.photograph(), (Prompt(1, "car"), Prompt(2, "person"))
+    one, two = coarse.segment(image, prompts).dense, fine.segment(image, prompts).dense
+    found = both.segment(image, prompts)
+    np.testing.assert_array_equal(live.segment(image, prompts).dense.score, one.score)
+    assert (found.dense.grid, found.dense.score.shape) == (two.grid, two.score.shape)
+    row, column = np.mgrid[0 : two.score.shape[0], 0 : two.score.shape[1]].reshape(2, -1)
+    u, v = (column - two.grid.offset_x) / two.grid.scale_x, (row - two.grid.offset_y) / two.grid.scale_y
+    wanted = (one.sample(u, v) + two.sample(u, v)) / 2
+    assert np.abs(one.sample(u, v) - two.sample(u, v)).max() > 0.2  # at rims they differ
+    np.testing.assert_allclose(found.dense.sample(u, v), wanted, atol=0.012)
+    assert [answer.status for answer in found.answers] == [Status.MATCHED] * 2
+    small = np.ascontiguousarray(image[:80, :112])  # enlarged it would tell nothing new
+    np.testing.assert_array_equal(
+        both.segment(small, prompts).dense.score, coarse.segment(small, prompts).dense.score
+    )
+
+
+def test_boxes_are_looked_for_at_the_fine_size_alone(tmp_path: Path) -> None:
+    networks.yolo_raw(tmp_path / "model.onnx")
+    said = manifest("yolo-seg", classes=networks.CLASSES, input_size=(64, 96), fine_input_size=(128, 160))
+    fine = yolo_raw(tmp_path).segment(networks.photograph(), PROMPTS)
+    found = open_model(said, tmp_path, fine=True).segment(networks.photograph(), PROMPTS)
+    np.testing.assert_array_equal(found.dense.score, fine.dense.score)
+    assert open_model(said, tmp_path).segment(networks.photograph(), PROMPTS).dense.score.shape[:2] == (
+        16,
+        24,
+    )
+
+
 def test_what_a_class_owes_to_its_frequency_is_taken_out_of_the_map_s_scores(tmp_path: Path) -> None:
     networks.semantic(tmp_path / "model.onnx")
     said = manifest("semantic", classes=("background", *networks.CLASSES), input_size=(120, 160), stride=8)

@@ -143,6 +143,21 @@ def test_what_shows_only_when_it_runs(registry: Registry, tmp_path: Path) -> Non
     assert add(registry, model, classes=tuple("abcd")).outputs == {"logits": (1, 4, 25, 25)}
 
 
+def test_a_fine_size(registry: Registry, tmp_path: Path) -> None:
+    names, size = tuple("abcd"), {"input_size": (64, 96)}
+    path = networks.semantic(tmp_path / "s.onnx")
+    for fine in ((64, 96), (96, 64)):
+        assert "is not finer than the input size 64x96" in refused(
+            registry, path, classes=names, fine_input_size=fine, **size
+        )
+    one_size = networks.semantic(tmp_path / "o.onnx", (64, 96))
+    assert "of one size only" in refused(registry, one_size, classes=names, fine_input_size=(128, 192))
+    assert add(registry, path, classes=names, fine_input_size=(96, 144), **size).fine_input_size == (96, 144)
+    assert registry.find().open(fine=True).segment(np.zeros((96, 144, 3), np.uint8), []).dense.score.shape == (
+        24, 36, 1,
+    )  # fmt: skip
+
+
 def test_flipped_bytes_are_one_sentence_or_work(
     registry: Registry, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -280,6 +295,7 @@ def test_the_command(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         (["add", "gone.onnx"], "--sha256 H"),
         (["add", "gone.onnx", "--part", "image"], "write it as ROLE=FILE"),
         (["add", "gone.onnx", "--input-size", "7"], "give height and width"),
+        (["add", "gone.onnx", "--fine-input-size", "8x8"], "--fine-input-size 8x8: give height and width"),
         (["add", "gone.onnx", "--classes", "gone.txt"], "cannot read gone.txt"),
         (["remove", "gone"], "no model named 'gone'"),
         (["test", "gone"], "no model named 'gone'"),

@@ -59,6 +59,10 @@ def _add_parser(actions: Any) -> None:
     parser.add_argument(
         "--input-size", metavar="HxW", help="for networks that take any size (default: 480x640)"
     )
+    parser.add_argument(
+        "--fine-input-size", metavar="HxW",
+        help="reprocess and ask read large photographs at this size, too (networks that take any size)",
+    )  # fmt: skip
     parser.add_argument("--synthetic-only", action="store_true", help="trained on virtual worlds")
     json_option(parser)
 
@@ -75,7 +79,10 @@ def run_add(given: argparse.Namespace) -> int:
         licence=given.licence,
         classes=() if given.classes is None else read_classes(given.classes),
         parts={role: Path(file) for role, file in _pairs("--part", given.part)},
-        input_size=None if given.input_size is None else _size(given.input_size),
+        input_size=None if given.input_size is None else _size("--input-size", given.input_size),
+        fine_input_size=(
+            None if given.fine_input_size is None else _size("--fine-input-size", given.fine_input_size)
+        ),
         synthetic_only=given.synthetic_only,
     )
     manifest, smoke = Registry().add(wanted)
@@ -121,7 +128,7 @@ def run_test(given: argparse.Namespace) -> int:
     if given.query and given.image is None:
         raise InputError("--query needs a photograph to look at: give --image FILE")
     entry = Registry().find(given.name)
-    backend = entry.open()
+    backend = entry.open(fine=True)
     smoke = smoke_test(backend)
     result: dict[str, Any] = {"name": backend.name, "cpu_ms": round(smoke.ms, 2), "classes": backend.classes}
     if given.image is not None:
@@ -188,14 +195,12 @@ def _pairs(option: str, texts: Iterable[str]) -> Iterable[tuple[str, str]]:
         yield role, value
 
 
-def _size(text: str) -> tuple[int, int]:
+def _size(option: str, text: str) -> tuple[int, int]:
     height, _, width = text.lower().partition("x")
     if not (
         height.isdecimal() and width.isdecimal() and 32 <= int(height) <= 4096 and 32 <= int(width) <= 4096
     ):
-        raise InputError(
-            f"--input-size {text}: give height and width of 32 to 4096 pixels, for example 480x640"
-        )
+        raise InputError(f"{option} {text}: give height and width of 32 to 4096 pixels, for example 480x640")
     return int(height), int(width)
 
 

@@ -67,10 +67,22 @@ class Grid:
 
     def at_pixels(self, cells: F32 | U8, width: int, height: int, repeat: bool = False) -> F32 | U8:
         """A map (h, w) seen at every pixel of an image, bilinear; beyond it 0, or its border where ``repeat``."""
-        from_pixels = np.array([[self.scale_x, 0.0, self.offset_x], [0.0, self.scale_y, self.offset_y]])
+        return self.at_cells(cells, Grid(1.0, 1.0, 0.0, 0.0), width, height, repeat)
+
+    def at_cells(
+        self, cells: F32 | U8, other: Grid, width: int, height: int, repeat: bool = False
+    ) -> F32 | U8:
+        """As ``at_pixels``, but at the ``width`` x ``height`` cells of another map of the same image."""
+        across, down = self.scale_x / other.scale_x, self.scale_y / other.scale_y
+        from_other = np.array(
+            [
+                [across, 0.0, self.offset_x - across * other.offset_x],
+                [0.0, down, self.offset_y - down * other.offset_y],
+            ]
+        )
         return cv2.warpAffine(  # type: ignore[no-any-return]
             np.ascontiguousarray(cells),
-            from_pixels,
+            from_other,
             (width, height),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE if repeat else cv2.BORDER_CONSTANT,

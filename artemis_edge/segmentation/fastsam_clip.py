@@ -19,7 +19,7 @@ from artemis_edge.segmentation.letterbox import Letterbox
 from artemis_edge.segmentation.manifest import Manifest
 from artemis_edge.segmentation.network import Network
 from artemis_edge.segmentation.words import vocabulary
-from artemis_edge.segmentation.yolo_seg import PAD, Thresholds, assemble, input_of, instances
+from artemis_edge.segmentation.yolo_seg import PAD, Thresholds, assemble, input_sizes, instances
 
 # FastSAM's own choices for its everything mode; 32 regions bound the time that CLIP takes.
 _REGIONS = Thresholds(score=0.4, overlap=0.9, most=32)
@@ -74,8 +74,8 @@ class FastSamClip:
 
     def segment(self, image: U8, prompts: Sequence[Prompt]) -> Segmentation:
         """Regions of the image that fit the prompts; see :class:`Backend`."""
-        size, fixed = input_of(self._network, self._manifest)
-        box = Letterbox.fit(image.shape[:2], size, fixed, self._manifest.stride, centred=True)
+        sizes, fixed = input_sizes(self._network, self._manifest, image.shape)
+        box = Letterbox.fit(image.shape[:2], sizes[-1], fixed, self._manifest.stride, centred=True)
         outputs = self._network.run(box.fill(image, PAD, self._manifest.mean, self._manifest.std))
         yolo.check_classes(outputs, 1, self.name)
         raw, protos = yolo.candidates(outputs, [0], _REGIONS.score)

@@ -13,6 +13,7 @@ from artemis_edge.export.atomic import write_bytes
 
 Kind = Literal["yolo-seg", "fastsam-clip", "openvocab-seg", "semantic", "attribute"]
 
+Side = Annotated[int, Meta(ge=32, le=4096)]
 Hash = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 #: A file name beside the manifest, not a path.
 FileName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
@@ -31,7 +32,8 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ``classes`` are the names of its outputs in order (empty: any text). For ``semantic`` one of them may be
     called "background"; it and classes nobody asks for count as background.
     ``input_size`` is (height, width) of the input. Where the file leaves height and width open, images are scaled
-    to fit into it and padded to the next multiple of ``stride`` only.
+    to fit into it and padded to the next multiple of ``stride`` only. ``fine_input_size``, the same, is what images are
+    read at, too, where nobody waits for a frame and an image has so many pixels; only where the file leaves them open.
     ``mean`` and ``std`` per channel, RGB on 0..1: the network is given (rgb / 255 - mean) / std.
     ``shares`` of the classes in the pixels that the probabilities of a ``semantic`` network were calibrated on, in the
     order of ``classes`` (empty: not known).
@@ -44,7 +46,8 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     sha256: Hash
     licence: str
     classes: tuple[str, ...] = ()
-    input_size: tuple[Annotated[int, Meta(ge=32, le=4096)], Annotated[int, Meta(ge=32, le=4096)]] = (480, 640)
+    input_size: tuple[Side, Side] = (480, 640)
+    fine_input_size: tuple[Side, Side] | None = None
     stride: Annotated[int, Meta(ge=1, le=128)] = 32
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from artemis_edge.errors import InputError
@@ -104,12 +105,19 @@ def names_in(network: Network) -> tuple[str, ...]:
     return tuple(str(said[k]) for k in range(len(said)))
 
 
-def open_model(manifest: Manifest, folder: Path, thresholds: Thresholds | None = None) -> Backend:
-    """The backend of a model whose files are in ``folder``; raises InputError where something does not fit."""
+def open_model(
+    manifest: Manifest, folder: Path, thresholds: Thresholds | None = None, fine: bool = False
+) -> Backend:
+    """The backend of a model whose files are in ``folder``; raises InputError where something does not fit.
+
+    ``fine``: nobody waits for it, so large images are read at the manifest's fine size, too, where it has one.
+    """
     if manifest.kind == "attribute":
         return AttributeBackend()
     network = Network(folder / manifest.file)
     check_signature(network, manifest.kind, len(manifest.classes))
+    if not fine:
+        manifest = msgspec.structs.replace(manifest, fine_input_size=None)
     limits = thresholds or Thresholds()
     makers: dict[Kind, Callable[[], Backend]] = {
         "yolo-seg": lambda: YoloSeg(network, manifest, limits),

@@ -18,7 +18,7 @@ from artemis_edge.segmentation.clip import TextFeatures
 from artemis_edge.segmentation.letterbox import Letterbox
 from artemis_edge.segmentation.manifest import Manifest
 from artemis_edge.segmentation.network import Network
-from artemis_edge.segmentation.yolo_seg import PAD, Thresholds, assemble, input_of, instances
+from artemis_edge.segmentation.yolo_seg import PAD, Thresholds, assemble, input_sizes, instances
 
 
 class OpenVocabulary:
@@ -43,8 +43,8 @@ class OpenVocabulary:
 
     def segment(self, image: U8, prompts: Sequence[Prompt]) -> Segmentation:
         """Instances of the prompts by the network; see :class:`Backend`."""
-        size, fixed = input_of(self._network, self._manifest)
-        box = Letterbox.fit(image.shape[:2], size, fixed, self._manifest.stride, centred=True)
+        sizes, fixed = input_sizes(self._network, self._manifest, image.shape)
+        box = Letterbox.fit(image.shape[:2], sizes[-1], fixed, self._manifest.stride, centred=True)
         support = [self.support(prompt.text) for prompt in prompts]
         known = [p for p, s in zip(prompts, support, strict=True) if s.status is not Status.UNSUPPORTED]
         filled = box.fill(image, PAD, self._manifest.mean, self._manifest.std)

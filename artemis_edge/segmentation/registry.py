@@ -50,6 +50,7 @@ class Addition:
     classes: tuple[str, ...] = ()
     parts: Mapping[str, Path] = field(default_factory=dict)
     input_size: tuple[int, int] | None = None
+    fine_input_size: tuple[int, int] | None = None
     synthetic_only: bool = False
 
 
@@ -62,14 +63,14 @@ class Entry:
     shipped: bool
     problem: str = ""
 
-    def open(self, thresholds: Thresholds | None = None) -> Backend:
-        """The model at work; raises InputError where its files are damaged."""
+    def open(self, thresholds: Thresholds | None = None, fine: bool = False) -> Backend:
+        """The model at work, ``fine`` as of :func:`open_model`; raises InputError where its files are damaged."""
         if self.manifest.kind == "attribute":
             return open_model(self.manifest, self.folder)
         problem = self.problem or _damage(self.manifest, self.folder)
         if problem:
             raise InputError(problem)
-        return open_model(self.manifest, self.folder, thresholds)
+        return open_model(self.manifest, self.folder, thresholds, fine)
 
 
 def store_folder() -> Path:
@@ -87,9 +88,9 @@ def shipped_folder() -> Path:
     return Path(str(resources.files("artemis_edge.segmentation") / "shipped"))
 
 
-def open_by_name(name: str = "", thresholds: Thresholds | None = None) -> Backend:
-    """A model at work by its name; a function that a process of its own can be given."""
-    return Registry().find(name).open(thresholds)
+def open_by_name(name: str = "", thresholds: Thresholds | None = None, fine: bool = False) -> Backend:
+    """A model at work by its name, ``fine`` as of :func:`open_model`; a process can be given the function."""
+    return Registry().find(name).open(thresholds, fine)
 
 
 class Registry:
@@ -166,9 +167,9 @@ class Registry:
             outputs={key: tuple(side or 0 for side in shape) for key, shape in network.outputs.items()},
             synthetic_only=wanted.synthetic_only,
         )
-        return (
-            said if wanted.input_size is None else msgspec.structs.replace(said, input_size=wanted.input_size)
-        )
+        if wanted.input_size is not None:
+            said = msgspec.structs.replace(said, input_size=wanted.input_size)
+        return _with_fine_size(said, network, wanted.fine_input_size)
 
     @contextmanager
     def _new_folder(self, name: str) -> Iterator[Path]:
@@ -184,6 +185,24 @@ class Registry:
             ) from None
         finally:
             shutil.rmtree(part, ignore_errors=True)
+
+
+def _with_fine_size(said: Manifest, network: Network, fine: tuple[int, int] | None) -> Manifest:
+    """The manifest with a second, finer size to read at, where the network can be read at several."""
+    if fine is None:
+        return said
+    if all(next(iter(network.inputs.values()))[2:]):
+        raise InputError(
+            f"{network.file} takes images of one size only; leave --fine-input-size out, or export it with open sides"
+        )
+    if not any(fine[k] > said.input_size[k] for k in (0, 1)) or any(
+        fine[k] < said.input_size[k] for k in (0, 1)
+    ):
+        ours, theirs = ("x".join(map(str, size)) for size in (fine, said.input_size))
+        raise InputError(
+            f"--fine-input-size {ours} is not finer than the input size {theirs}; give a larger one"
+        )
+    return msgspec.structs.replace(said, fine_input_size=fine)
 
 
 def _part_of(role: str, path: Path, sha256: str) -> Part:

@@ -25,7 +25,7 @@ from artemis_edge.segmentation.letterbox import Letterbox
 from artemis_edge.segmentation.manifest import Manifest
 from artemis_edge.segmentation.network import Array, Network
 from artemis_edge.segmentation.words import canonical
-from artemis_edge.segmentation.yolo_seg import Thresholds, closed_support, input_of
+from artemis_edge.segmentation.yolo_seg import Thresholds, closed_support, input_sizes
 
 _LEAST_CELLS = 4  # smaller patches are noise of single cells
 _PAD = 0
@@ -96,18 +96,8 @@ class Semantic:
 
     def segment(self, image: U8, prompts: Sequence[Prompt]) -> Segmentation:
         """Label the image by the network; see :class:`Backend`."""
-        size, fixed = input_of(self._network, self._manifest)
-        box = Letterbox.fit(image.shape[:2], size, fixed, self._manifest.stride, centred=False)
-        filled = box.fill(image, _PAD, self._manifest.mean, self._manifest.std)
-        (logits,) = self._network.run(filled).values()
-        if logits.shape[1] != len(self.classes):
-            raise InputError(
-                f"the model {self.name} gives {logits.shape[1]} classes, {len(self.classes)} are named; "
-                "register it again with the names that it was trained with"
-            )
-        rows, columns = box.cells(logits.shape[3], logits.shape[2])
-        grid = box.grid(logits.shape[3], logits.shape[2]).cropped(columns.start, rows.start)
-        view = _View(probabilities(logits[0, :, rows, columns]), grid, box)
+        view = self._look(image)
+        box = view.box
         support = [self.support(prompt.text) for prompt in prompts]
         known = [p for p, s in zip(prompts, support, strict=True) if s.status is not Status.UNSUPPORTED]
         found = self._instances(view, known)
@@ -118,6 +108,30 @@ class Semantic:
             tuple(found),
             self._dense(view, known),
         )
+
+    def _look(self, image: U8) -> _View:
+        """The image at all sizes that it is read at: the mean of their probabilities, on the cells of the finest."""
+        sizes, fixed = input_sizes(self._network, self._manifest, image.shape)
+        *coarser, view = (self._read(image, size, fixed) for size in sizes)
+        for other in coarser:
+            for mine, theirs in zip(view.probability, other.probability, strict=True):
+                mine += other.grid.at_cells(theirs, view.grid, mine.shape[1], mine.shape[0], repeat=True)
+        if coarser:
+            view.probability[:] /= len(sizes)
+        return view
+
+    def _read(self, image: U8, size: tuple[int, int], fixed: bool) -> _View:
+        box = Letterbox.fit(image.shape[:2], size, fixed, self._manifest.stride, centred=False)
+        filled = box.fill(image, _PAD, self._manifest.mean, self._manifest.std)
+        (logits,) = self._network.run(filled).values()
+        if logits.shape[1] != len(self.classes):
+            raise InputError(
+                f"the model {self.name} gives {logits.shape[1]} classes, {len(self.classes)} are named; "
+                "register it again with the names that it was trained with"
+            )
+        rows, columns = box.cells(logits.shape[3], logits.shape[2])
+        grid = box.grid(logits.shape[3], logits.shape[2]).cropped(columns.start, rows.start)
+        return _View(probabilities(logits[0, :, rows, columns]), grid, box)
 
     def _dense(self, view: _View, prompts: Sequence[Prompt]) -> DenseScores:
         """A layer a prompt; what is left of probability 1 is background."""

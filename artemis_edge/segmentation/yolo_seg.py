@@ -31,12 +31,20 @@ class Thresholds:
         return cls(config.least_score, config.overlap)
 
 
-def input_of(network: Network, manifest: Manifest) -> tuple[tuple[int, int], bool]:
-    """Size (height, width) of the network's input and whether it is fixed."""
+def input_sizes(
+    network: Network, manifest: Manifest, image: tuple[int, ...]
+) -> tuple[list[tuple[int, int]], bool]:
+    """Sizes (height, width) to read an ``image`` (height, width, ...) at, coarse first, and whether they are fixed.
+
+    The fine size of the manifest is among them where the image has the pixels: enlarged it would tell nothing new.
+    """
     _, _, height, width = next(iter(network.inputs.values()))
-    if height is None or width is None:
-        return manifest.input_size, False
-    return (height, width), True
+    if height is not None and width is not None:
+        return [(height, width)], True
+    sizes, fine = [manifest.input_size], manifest.fine_input_size
+    if fine is not None and (image[0] >= fine[0] or image[1] >= fine[1]):
+        sizes.append(fine)
+    return sizes, False
 
 
 def instances(
@@ -82,8 +90,8 @@ class YoloSeg:
 
     def segment(self, image: U8, prompts: Sequence[Prompt]) -> Segmentation:
         """Instances of the prompts by the network; see :class:`Backend`."""
-        size, fixed = input_of(self._network, self._manifest)
-        box = Letterbox.fit(image.shape[:2], size, fixed, self._manifest.stride, centred=True)
+        sizes, fixed = input_sizes(self._network, self._manifest, image.shape)
+        box = Letterbox.fit(image.shape[:2], sizes[-1], fixed, self._manifest.stride, centred=True)
         outputs = self._network.run(box.fill(image, PAD, self._manifest.mean, self._manifest.std))
         return self.decode(outputs, box, prompts)
 
