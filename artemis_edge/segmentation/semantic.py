@@ -45,7 +45,7 @@ def probabilities(logits: Array) -> F32:
 
 
 def without_frequency(probability: F32, rows: Sequence[int], shares: F64) -> F32:
-    """Scores (h, w, 1 + r) of background and the classes ``rows`` from ``probability`` (C, h, w) of all, less what
+    """Scores (1 + r, h, w) of background and the classes ``rows`` from ``probability`` (C, h, w) of all, less what
     each class owes to its frequency ``shares`` (C,); background, all other classes, has that of all of them together.
 
     Calibrated probabilities hold how frequent a class is. A map that adds up what many images say would count that
@@ -60,10 +60,11 @@ def without_frequency(probability: F32, rows: Sequence[int], shares: F64) -> F32
         together = shares[rest].sum()
         factor[rest] *= together ** (1.0 - _TAKEN_OUT) / (shares[rest] * factor[rest]).sum()
     weight = factor.astype(np.float32)
-    nothing = np.tensordot(weight[rest], probability[rest], 1)
-    score = np.stack([nothing, *(weight[row] * probability[row] for row in rows)], axis=2)
-    balanced: F32 = score / score.sum(axis=2, keepdims=True)
-    return balanced
+    # with zeros instead of a choice of the rest, which would copy most of what is there
+    nothing = np.tensordot(np.where(rest, weight, np.float32(0.0)), probability, 1)
+    score: F32 = np.stack([nothing, *(weight[row] * probability[row] for row in rows)])
+    score /= score.sum(axis=0)
+    return score
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,17 +141,18 @@ class Semantic:
             score = without_frequency(view.probability, rows, self._shares)
         else:
             nothing = 1.0 - view.probability[rows].sum(axis=0)
-            score = np.stack([nothing, *view.probability[rows]], axis=2)
+            score = np.stack([nothing, *view.probability[rows]])
         layers = [0, *(1 + rows.index(self._row[prompt.text]) for prompt in prompts)]
         slots = (BACKGROUND, *(prompt.slot for prompt in prompts))
-        return DenseScores(slots, scores.quantised(score[:, :, layers]), view.grid)
+        planes = [scores.quantised(plane) for plane in score]
+        return DenseScores(slots, np.stack([planes[k] for k in layers], axis=2), view.grid)
 
     def _instances(self, view: _View, prompts: Sequence[Prompt]) -> list[Instance]:
-        winner = view.probability.argmax(axis=0)
+        highest = view.probability.max(axis=0)
         out: list[Instance] = []
         for prompt in prompts:
             row = self._row[prompt.text]
-            won = (winner == row).astype(np.uint8)
+            won = (view.probability[row] >= highest).astype(np.uint8)
             _, label, stats, _ = cv2.connectedComponentsWithStats(won, connectivity=8)
             big = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _LEAST_CELLS)
             for part in big[big > 0]:
