@@ -7,8 +7,10 @@ the containing triangle short.
 
 from __future__ import annotations
 
+import numpy as np
+
 from artemis_edge._jit import kernel
-from artemis_edge.frames import F64, I32
+from artemis_edge.frames import F64, U32
 
 # Corners of the triangle that encloses everything, in units of the coordinates (voxels are below 10 m)
 _FAR = 1.0e3
@@ -40,83 +42,87 @@ def in_circle(x: F64, y: F64, a: int, b: int, c: int, p: int) -> bool:
 
 
 @kernel
-def _replace(link: I32, triangle: int, old: int, new: int) -> None:
-    if triangle >= 0:
-        for k in range(3):
-            if link[triangle, k] == old:
-                link[triangle, k] = new
+def _at(places: U32, i: int) -> int:
+    """An element that is a place itself. Unsigned, so that the compiler need not ask whether it counts from the end:
+    that question at every look-up took a quarter of the time."""
+    return int(np.int64(places[i]))
 
 
 @kernel
-def _walk(x: F64, y: F64, corner: I32, link: I32, t: int, p: int, limit: int) -> int:
+def _walk(x: F64, y: F64, corner: U32, link: U32, t: int, p: int, limit: int) -> int:
     for _ in range(limit):
-        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
+        a, b, c = _at(corner, t), _at(corner, t + 1), _at(corner, t + 2)
         if _left_of(x, y, a, b, p) < 0.0:
-            t = link[t, 2]
+            t = _at(link, t + 2) & ~3
         elif _left_of(x, y, b, c, p) < 0.0:
-            t = link[t, 0]
+            t = _at(link, t) & ~3
         elif _left_of(x, y, c, a, p) < 0.0:
-            t = link[t, 1]
+            t = _at(link, t + 1) & ~3
         else:
             break
     return t
 
 
 @kernel
-def _split(corner: I32, link: I32, t: int, p: int, n: int) -> None:
-    """Triangle t becomes (a, b, p), (b, c, p), (c, a, p) at t, n, n + 1: p is always corner 2."""
-    a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
-    over_a, over_b, over_c = link[t, 0], link[t, 1], link[t, 2]
-    corner[t, 2] = p
-    link[t, 0], link[t, 1], link[t, 2] = n, n + 1, over_c
-    corner[n, 0], corner[n, 1], corner[n, 2] = b, c, p
-    link[n, 0], link[n, 1], link[n, 2] = n + 1, t, over_a
-    corner[n + 1, 0], corner[n + 1, 1], corner[n + 1, 2] = c, a, p
-    link[n + 1, 0], link[n + 1, 1], link[n + 1, 2] = t, n, over_b
-    _replace(link, over_a, t, n)
-    _replace(link, over_b, t, n + 1)
+def _split(corner: U32, link: U32, t: int, p: int, u: int) -> None:
+    """The triangle (a, b, c) at t becomes (a, b, p), (b, c, p), (c, a, p) at t, u, u + 4: p is always corner 2."""
+    v = u + 4
+    a, b, c = _at(corner, t), _at(corner, t + 1), _at(corner, t + 2)
+    beyond_bc, beyond_ca = _at(link, t), _at(link, t + 1)
+    corner[t + 2] = p
+    link[t], link[t + 1] = u + 1, v
+    corner[u], corner[u + 1], corner[u + 2] = b, c, p
+    link[u], link[u + 1], link[u + 2] = v + 1, t, beyond_bc
+    corner[v], corner[v + 1], corner[v + 2] = c, a, p
+    link[v], link[v + 1], link[v + 2] = t + 1, u, beyond_ca
+    link[beyond_bc], link[beyond_ca] = u + 2, v + 2
 
 
 @kernel
-def _flip(corner: I32, link: I32, s: int, o: int, k: int) -> None:
-    """Exchange the edge a-b of s = (a, b, p) and o (d at corner k) for the edge d-p."""
-    b, p, d = corner[s, 1], corner[s, 2], corner[o, k]
-    beyond_bd, beyond_da, beyond_bp = link[o, (k + 2) % 3], link[o, (k + 1) % 3], link[s, 0]
-    corner[s, 1] = d
-    link[s, 2], link[s, 0] = beyond_da, o
-    corner[o, 0], corner[o, 1], corner[o, 2] = d, b, p
-    link[o, 2], link[o, 0], link[o, 1] = beyond_bd, beyond_bp, s
-    _replace(link, beyond_da, o, s)
-    _replace(link, beyond_bp, s, o)
+def _flip(corner: U32, link: U32, s: int, over: int) -> int:
+    """Exchange the edge a-b of s = (a, b, p) and the triangle on its other side, whose corner d is at ``over``, for
+    the edge d-p. Returns the place of that triangle."""
+    o, k = over & ~3, over & 3
+    b, p, d = _at(corner, s + 1), _at(corner, s + 2), _at(corner, over)
+    beyond_da = _at(link, o + (k + 1 if k < 2 else 0))
+    beyond_bd = _at(link, o + (k - 1 if k > 0 else 2))
+    beyond_bp = _at(link, s)
+    corner[s + 1] = d
+    link[s + 2], link[s] = beyond_da, o + 1
+    corner[o], corner[o + 1], corner[o + 2] = d, b, p
+    link[o], link[o + 1], link[o + 2] = beyond_bp, s, beyond_bd
+    link[beyond_da], link[beyond_bd], link[beyond_bp] = s + 2, o + 2, o
+    return o
 
 
 @kernel
-def delaunay(x: F64, y: F64, n: int, corner: I32, link: I32, stack: I32) -> int:
+def delaunay(x: F64, y: F64, n: int, corner: U32, link: U32, stack: U32) -> int:
     """Triangulate points 0..n-1; ``x`` and ``y`` float64 with room for n + 3.
 
-    ``corner`` and ``link`` int32 (2 n + 1, 3) receive counter-clockwise triangles and, opposite each corner, the
-    adjacent triangle or -1; ``stack`` int32 (4 n + 8). Triangles with a corner >= n belong to the enclosing
-    triangle. Returns the number of triangles. Points must be finite; duplicates give triangles without area.
+    ``corner`` and ``link`` uint32 (4 (2 n + 2),) receive counter-clockwise triangles: number t has its corners at
+    4 t, 4 t + 1, 4 t + 2. ``link`` tells for each of these places the place of the corner that lies across the
+    opposite edge; where there is none, 4 (2 n + 1). ``stack`` uint32 (4 n + 8). Triangles with a corner >= n belong
+    to the enclosing triangle. Returns the number of triangles. Points must be finite; duplicates give triangles
+    without area.
     """
     x[n], y[n], x[n + 1], y[n + 1], x[n + 2], y[n + 2] = -_FAR, -_FAR, _FAR, -_FAR, 0.0, _FAR
-    corner[0, 0], corner[0, 1], corner[0, 2] = n, n + 1, n + 2
-    link[0, 0] = link[0, 1] = link[0, 2] = -1
-    count, t = 1, 0
+    outside = 4 * (2 * n + 1)
+    corner[0], corner[1], corner[2] = n, n + 1, n + 2
+    link[0] = link[1] = link[2] = outside
+    end, t = 4, 0
     for p in range(n):
         t = _walk(x, y, corner, link, t, p, 4 * n + 8)
-        _split(corner, link, t, p, count)
-        stack[0], stack[1], stack[2] = t, count, count + 1
-        count += 2
+        _split(corner, link, t, p, end)
+        stack[0], stack[1], stack[2] = t, end, end + 4
+        end += 8
         top = 3
         while top > 0:
             top -= 1
-            s = stack[top]
-            o = link[s, 2]
-            if o < 0:
+            s = _at(stack, top)
+            over = _at(link, s + 2)
+            if over == outside:
                 continue
-            k = 0 if link[o, 0] == s else (1 if link[o, 1] == s else 2)
-            if in_circle(x, y, corner[s, 0], corner[s, 1], p, corner[o, k]):
-                _flip(corner, link, s, o, k)
-                stack[top], stack[top + 1] = s, o
+            if in_circle(x, y, _at(corner, s), _at(corner, s + 1), p, _at(corner, over)):
+                stack[top], stack[top + 1] = s, _flip(corner, link, s, over)
                 top += 2
-    return count
+    return end // 4

@@ -40,7 +40,7 @@ from artemis_edge.block_store import (
 from artemis_edge.cell_code import CODES, code_voxel, gather_cells, neighbour_shift
 from artemis_edge.config import MesherConfig
 from artemis_edge.delaunay import delaunay
-from artemis_edge.frames import F32, F64, I32, U8
+from artemis_edge.frames import F32, F64, I32, U8, U32
 from artemis_edge.semantic_constraint import SemanticConstraint, confident_class
 from artemis_edge.voxel_map import AT_ONCE, RefreshRules, RefreshSpace, VoxelMap, refresh_space, refresh_voxel
 
@@ -88,9 +88,9 @@ class Workspace(NamedTuple):
     rank: F64  # (m,)
     x: F64  # (m + 3,)
     y: F64
-    corner: I32  # (2 m + 1, 3)
-    link: I32
-    stack: I32
+    corner: U32  # (8 m + 8,) see delaunay.py
+    link: U32
+    stack: U32
     hole: I32  # (e, 3) free edges: start, end, next of the same start
     hole_of: I32  # (m,) first free edge of a vertex
     ear: I32  # (27 MOST_TRIANGLES, 5) neighbours' ears: voxel slot, index, local corners
@@ -122,9 +122,9 @@ def workspace() -> Workspace:
         rank=np.empty(m),
         x=np.empty(m + 3),
         y=np.empty(m + 3),
-        corner=np.empty((2 * m + 1, 3), np.int32),
-        link=np.empty((2 * m + 1, 3), np.int32),
-        stack=np.empty(8 * m, np.int32),
+        corner=np.empty(8 * m + 8, np.uint32),
+        link=np.empty(8 * m + 8, np.uint32),
+        stack=np.empty(4 * m + 8, np.uint32),
         hole=np.empty((27 * MOST_TRIANGLES, 3), np.int32),
         hole_of=np.empty(m, np.int32),
         ear=np.empty((27 * MOST_TRIANGLES, 5), np.int32),
@@ -397,7 +397,7 @@ def _mesh_group(
     if m >= 3:
         count = delaunay(w.x, w.y, m, w.corner, w.link, w.stack)
         for t in range(count):
-            i, j, k = w.corner[t, 0], w.corner[t, 1], w.corner[t, 2]
+            i, j, k = w.corner[4 * t], w.corner[4 * t + 1], w.corner[4 * t + 2]
             if i >= m or j >= m or k >= m:
                 continue
             a, b, c = w.order[i], w.order[j], w.order[k]

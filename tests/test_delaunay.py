@@ -13,14 +13,20 @@ Triangles = set[tuple[int, int, int]]
 
 
 def _triangulate(points: F64) -> tuple[I32, I32, F64, F64]:
-    """All triangles with their links; rows n..n+2 of the coordinates are the enclosing triangle's."""
+    """All triangles with the triangles beside them, opposite each corner, -1 where none; rows n..n+2 of the
+    coordinates are the enclosing triangle's."""
     n = len(points)
     x, y = np.zeros(n + 3), np.zeros(n + 3)
     x[:n], y[:n] = points[:, 0], points[:, 1]
-    corner, link = np.full((2 * n + 1, 3), -7, np.int32), np.full((2 * n + 1, 3), -7, np.int32)
-    count = delaunay(x, y, n, corner, link, np.empty(4 * n + 8, np.int32))
+    corner, link = np.full((2, 4 * (2 * n + 2)), 999_999, np.uint32)
+    count = delaunay(x, y, n, corner, link, np.empty(4 * n + 8, np.uint32))
     assert count == 2 * n + 1
-    return corner[:count], link[:count], x, y
+    place = link.reshape(-1, 4)[:count, :3].astype(np.int32)
+    inside = place < 4 * count
+    for t, k in np.argwhere(inside):
+        assert link[place[t, k]] == 4 * t + k  # the corner across the edge links back
+    triangle = corner.reshape(-1, 4)[:count, :3].astype(np.int32)
+    return triangle, np.where(inside, place // 4, -1), x, y
 
 
 def _inner(corner: I32, n: int) -> Triangles:
