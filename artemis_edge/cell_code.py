@@ -90,3 +90,18 @@ def _masks() -> NDArray[np.uint64]:
 
 
 _WITHIN = _masks()
+
+
+def _near_voxels() -> NDArray[np.uint64]:
+    """Which of the 27 voxels but the own one touch each own cell, uint64 (64,), a bit for each voxel."""
+    own = _WITHIN[1]
+    cell = np.arange(64, dtype=np.uint64)
+    out = np.zeros(64, np.uint64)
+    for k in range(27):
+        if k != 13:
+            # the own cells in a neighbour's margin are those of the opposite neighbour in ours
+            out |= ((own[26 - k] >> cell) & np.uint64(1)) << np.uint64(k)
+    return out
+
+
+NEAR_VOXELS = _near_voxels()

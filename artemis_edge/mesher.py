@@ -40,7 +40,7 @@ from artemis_edge.block_store import (
 from artemis_edge.cell_code import CODES, code_voxel, gather_cells, neighbour_shift
 from artemis_edge.config import MesherConfig
 from artemis_edge.delaunay import delaunay
-from artemis_edge.frames import F32, F64, I32, U8, U32
+from artemis_edge.frames import F32, F64, I32, I64, U8, U32
 from artemis_edge.semantic_constraint import SemanticConstraint, confident_class
 from artemis_edge.voxel_map import AT_ONCE, RefreshRules, RefreshSpace, VoxelMap, refresh_space, refresh_voxel
 
@@ -55,6 +55,9 @@ MOST_GROUPS = 2  # a voxel may hold both sides of a thin wall
 MOST_OBJECTS = 4  # that meet in a voxel
 _NO_CLASS = -2
 EAR = 1 << 15  # flag in the first code of a triangle that only fills a gap
+# Coordinates 10 bits apart: the bits above them, and the least and largest sums of three that are owned
+_ABOVE = (512 << 20) | (512 << 10) | 512
+_FIRST_SUM, _LAST_SUM = (35 << 20) | (35 << 10) | 35, (46 << 20) | (46 << 10) | 46
 
 
 class Rules(NamedTuple):
@@ -73,9 +76,10 @@ class Workspace(NamedTuple):
 
     neighbour: I32  # (27,)
     grid: I32  # (CODES,) slot or local index, -1
-    code: I32  # (1728,)
-    slot: I32  # (m,)
-    local_code: I32  # (m,)
+    code: U32  # (1728,)
+    slot: U32  # (m,)
+    local_code: U32  # (m,)
+    spread: I64  # (m,) the code's coordinates 10 bits apart
     own: U8  # (m,)
     used: U8  # (m,)
     klass: I32  # (m,) class that the vertex certainly has, -1 where none
@@ -83,18 +87,18 @@ class Workspace(NamedTuple):
     normal: F64  # (m, 3)
     hits: F64  # (m,) points that hit the vertex' cell, as many as at close range
     edge: U8  # (m, m) directed edges in use
-    edges: I32  # (e, 2) list of them
-    order: I32  # (m,)
+    edges: U32  # (e, 2) list of them
+    order: U32  # (m,)
     rank: F64  # (m,)
     x: F64  # (m + 3,)
     y: F64
     corner: U32  # (8 m + 8,) see delaunay.py
     link: U32
     stack: U32
-    hole: I32  # (e, 3) free edges: start, end, next of the same start
-    hole_of: I32  # (m,) first free edge of a vertex
+    hole: U32  # (e, 3) free edges: start, end, next of the same start (counted from 1; 0: none)
+    hole_of: U32  # (m,) first free edge of a vertex (likewise)
     ear: I32  # (27 MOST_TRIANGLES, 5) neighbours' ears: voxel slot, index, local corners
-    triangles: I32  # (MOST_TRIANGLES, 3) local indices
+    triangles: U32  # (MOST_TRIANGLES, 3) local indices
     patch: NDArray[np.uint16]  # (MOST_TRIANGLES, 3) codes
     frame: F64  # (3, 3) rows: first axis, second axis, direction
     direction: F64  # (MOST_OBJECTS * MOST_GROUPS, 3)
@@ -107,9 +111,10 @@ def workspace() -> Workspace:
     return Workspace(
         neighbour=np.empty(27, np.int32),
         grid=np.full(CODES, -1, np.int32),
-        code=np.empty(1728, np.int32),
-        slot=np.empty(m, np.int32),
-        local_code=np.empty(m, np.int32),
+        code=np.empty(1728, np.uint32),
+        slot=np.empty(m, np.uint32),
+        local_code=np.empty(m, np.uint32),
+        spread=np.empty(m, np.int64),
         own=np.empty(m, np.uint8),
         used=np.empty(m, np.uint8),
         klass=np.empty(m, np.int32),
@@ -117,18 +122,18 @@ def workspace() -> Workspace:
         normal=np.empty((m, 3)),
         hits=np.empty(m),
         edge=np.zeros((m, m), np.uint8),
-        edges=np.empty((27 * MOST_TRIANGLES, 2), np.int32),
-        order=np.empty(m, np.int32),
+        edges=np.empty((27 * MOST_TRIANGLES, 2), np.uint32),
+        order=np.empty(m, np.uint32),
         rank=np.empty(m),
         x=np.empty(m + 3),
         y=np.empty(m + 3),
         corner=np.empty(8 * m + 8, np.uint32),
         link=np.empty(8 * m + 8, np.uint32),
         stack=np.empty(4 * m + 8, np.uint32),
-        hole=np.empty((27 * MOST_TRIANGLES, 3), np.int32),
-        hole_of=np.empty(m, np.int32),
+        hole=np.empty((27 * MOST_TRIANGLES, 3), np.uint32),
+        hole_of=np.empty(m, np.uint32),
         ear=np.empty((27 * MOST_TRIANGLES, 5), np.int32),
-        triangles=np.empty((MOST_TRIANGLES, 3), np.int32),
+        triangles=np.empty((MOST_TRIANGLES, 3), np.uint32),
         patch=np.empty((MOST_TRIANGLES, 3), np.uint16),
         frame=np.empty((3, 3)),
         direction=np.empty((MOST_OBJECTS * MOST_GROUPS, 3)),
@@ -139,25 +144,27 @@ def workspace() -> Workspace:
 @kernel
 def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace) -> bool:
     """Replace the patch of voxel ``v``; False when the triangle pool is full."""
+    if not _has_vertex(store, v):
+        return bs.set_patch(store, v, w.patch, 0)  # without own vertices nothing is owned
     bs.neighbours27(store, v, w.neighbour)
     cells = gather_cells(store, w.neighbour, MARGIN_CELLS, w.grid, w.code)
-    n = collect_vertices(store, v, cells, voxel_m, w)
+    n, own = collect_vertices(store, v, cells, voxel_m, w)
     _tell_apart(store, n, rules.confidence_rate, w)
     triangles = plain = 0
-    if n >= 3 and w.own[0]:  # own cells come first; without own vertices nothing is owned
+    if n >= 3:
         edges, ears = take_neighbour_edges(store, w)
         groups = 0
-        klass = _next_class(n, w)
+        klass = _next_class(own, w)
         while klass != _NO_CLASS and groups < MOST_OBJECTS * MOST_GROUPS:
             sides = 0
-            while sides < MOST_GROUPS and _direction(n, klass, w):
+            while sides < MOST_GROUPS and _direction(own, klass, w):
                 triangles, edges = _mesh_group(n, klass, rules, w, triangles, edges)
                 for k in range(3):
                     w.direction[groups + sides, k] = w.frame[2, k]
                 sides += 1
             groups += sides
             _give_up(n, klass, w)
-            klass = _next_class(n, w)
+            klass = _next_class(own, w)
         plain = triangles
         edges = _settle_ears(store, ears, w, edges)
         for g in range(groups):
@@ -175,15 +182,27 @@ def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace)
 
 
 @kernel
-def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Workspace) -> int:
-    """Living vertices of the voxel and its margin, positions relative to the voxel's corner.
+def _has_vertex(store: Store, v: int) -> bool:
+    """Whether a voxel has a living vertex."""
+    mask = store.voxel_mask[v]
+    while mask != 0:
+        if store.state[store.voxel_cell[v, bs.lowest_bit(mask)]] == ALIVE:
+            return True
+        mask &= mask - np.uint64(1)
+    return False
 
-    Afterwards ``grid[code]`` is the local index, or -1 where a cell has no living vertex.
+
+@kernel
+def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Workspace) -> tuple[int, int]:
+    """Living vertices of the voxel, which come first, and its margin; how many in all and how many own.
+
+    Positions are relative to the voxel's corner. Afterwards ``grid[code]`` is the local index, or -1 where a cell
+    has no living vertex.
     """
     x0, y0, z0 = store.voxel[v, 0] * voxel_m, store.voxel[v, 1] * voxel_m, store.voxel[v, 2] * voxel_m
-    n = 0
+    n = own = 0
     for i in range(cells):
-        code = w.code[i]
+        code = np.int64(w.code[i])
         s = w.grid[code]
         w.grid[code] = -1
         if store.state[s] != ALIVE or n == MOST_VERTICES:
@@ -192,7 +211,9 @@ def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Worksp
         w.slot[n] = s
         w.local_code[n] = code
         X, Y, Z = code >> 10, (code >> 5) & 31, code & 31
+        w.spread[n] = (X << 20) | (Y << 10) | Z
         w.own[n] = 1 if ((X - 12) | (Y - 12) | (Z - 12)) & ~3 == 0 else 0
+        own += w.own[n]
         w.used[n] = 0
         w.position[n, 0], w.position[n, 1], w.position[n, 2] = (
             p[POSITION] - x0,
@@ -203,7 +224,7 @@ def collect_vertices(store: Store, v: int, cells: int, voxel_m: float, w: Worksp
         w.hits[n] = hits_close_by(store.evidence[s])
         w.grid[code] = n
         n += 1
-    return n
+    return n, own
 
 
 @kernel
@@ -213,17 +234,17 @@ def _tell_apart(store: Store, n: int, rate: float, w: Workspace) -> None:
     for i in range(n):
         w.klass[i] = -1
         if told:
-            u = w.neighbour[code_voxel(w.local_code[i])]
+            u = w.neighbour[code_voxel(np.int64(w.local_code[i]))]
             weight = store.voxel_class[u, WEIGHT]
             w.klass[i] = confident_class(store.attribute[w.slot[i]], weight, rate)
 
 
 @kernel
-def _next_class(n: int, w: Workspace) -> int:
+def _next_class(own: int, w: Workspace) -> int:
     """The lowest certain class among the own vertices not meshed yet; -1 when only uncertain ones are left."""
     found = _NO_CLASS
-    for i in range(n):
-        if w.own[i] and not w.used[i] and (found == _NO_CLASS or found < 0 or 0 <= w.klass[i] < found):
+    for i in range(own):
+        if not w.used[i] and (found == _NO_CLASS or found < 0 or 0 <= w.klass[i] < found):
             found = w.klass[i]
     return found
 
@@ -259,9 +280,9 @@ def take_neighbour_edges(store: Store, w: Workspace) -> tuple[int, int]:
         at = store.voxel[u, PATCH_AT]
         for t in range(at, at + store.voxel[u, PATCH_LEN]):
             first = np.int64(store.triangle[t, 0])
-            a = w.grid[(first & ~EAR) + shift]
-            b = w.grid[np.int64(store.triangle[t, 1]) + shift]
-            c = w.grid[np.int64(store.triangle[t, 2]) + shift]
+            a = w.grid[np.uint32((first & ~EAR) + shift)]
+            b = w.grid[np.uint32(np.int64(store.triangle[t, 1]) + shift)]
+            c = w.grid[np.uint32(np.int64(store.triangle[t, 2]) + shift)]
             if (a < 0) + (b < 0) + (c < 0) > 1:
                 continue
             if first & EAR:
@@ -320,7 +341,7 @@ def _use_edge(w: Workspace, a: int, b: int, edges: int) -> int:
 
 
 @kernel
-def _direction(n: int, klass: int, w: Workspace) -> bool:
+def _direction(own: int, klass: int, w: Workspace) -> bool:
     """Projection frame for the own vertices of an object not meshed yet: their mean normal, to the nearest of 26
     directions.
 
@@ -329,8 +350,8 @@ def _direction(n: int, klass: int, w: Workspace) -> bool:
     d = w.frame[2]
     d[:] = 0.0
     left = 0
-    for i in range(n):
-        if w.own[i] and not w.used[i] and w.klass[i] <= klass and (w.klass[i] < 0 or w.klass[i] == klass):
+    for i in range(own):
+        if not w.used[i] and w.klass[i] <= klass and (w.klass[i] < 0 or w.klass[i] == klass):
             left += 1
             for k in range(3):
                 d[k] += w.normal[i, k]
@@ -401,7 +422,7 @@ def _mesh_group(
             if i >= m or j >= m or k >= m:
                 continue
             a, b, c = w.order[i], w.order[j], w.order[k]
-            if not _is_owned(a, b, c, w.local_code) or not is_surface(a, b, c, rules, w):
+            if not _is_owned(a, b, c, w.spread) or not is_surface(a, b, c, rules, w):
                 continue
             if w.edge[a, b] or w.edge[b, c] or w.edge[c, a]:
                 continue
@@ -443,16 +464,14 @@ def _accept(a: int, b: int, c: int, w: Workspace, triangles: int, edges: int) ->
 
 
 @kernel
-def _is_owned(a: int, b: int, c: int, code: I32) -> bool:
+def _is_owned(a: int, b: int, c: int, spread: I64) -> bool:
     """Whether the middle of the three cells lies in the own voxel: by cells, which never move, not by positions.
 
-    Own coordinates are 12..15, so three cell centres have their mean in the voxel when they sum to 35..46.
+    Own coordinates are 12..15, so three cell centres have their mean in the voxel when they sum to 35..46: all three
+    coordinates at once, the bit above each left over where it is no less than the first and no more than the last.
     """
-    for shift in (10, 5, 0):
-        total = ((code[a] >> shift) & 31) + ((code[b] >> shift) & 31) + ((code[c] >> shift) & 31)
-        if total < 35 or total > 46:
-            return False
-    return True
+    total = spread[a] + spread[b] + spread[c]
+    return ((total | _ABOVE) - _FIRST_SUM) & ((_LAST_SUM | _ABOVE) - total) & _ABOVE == _ABOVE
 
 
 @kernel
@@ -517,7 +536,7 @@ def _fill_ears(n: int, d: F64, rules: Rules, w: Workspace, triangles: int, edges
     turn the same way and hold no vertex; at least one corner is the voxel's own.
     """
     for i in range(n):
-        w.hole_of[i] = -1
+        w.hole_of[i] = 0
     holes = 0
     for i in range(edges):
         a, b = w.edges[i, 0], w.edges[i, 1]
@@ -528,9 +547,9 @@ def _fill_ears(n: int, d: F64, rules: Rules, w: Workspace, triangles: int, edges
         b, a = w.hole[i, 0], w.hole[i, 1]
         i += 1
         j = w.hole_of[a]
-        while j >= 0 and w.edge[b, a] == 0:
-            x = w.hole[j, 1]
-            j = w.hole[j, 2]
+        while j > 0 and w.edge[b, a] == 0:
+            x = w.hole[j - 1, 1]
+            j = w.hole[j - 1, 2]
             if x == b or w.edge[a, x] or w.edge[x, b] or not (w.own[a] or w.own[b] or w.own[x]):
                 continue
             if not _faces_out(b, a, x, w) or triangles == MOST_TRIANGLES or not is_one_object(b, a, x, w):
@@ -555,9 +574,9 @@ def _is_loop(w: Workspace, b: int, x: int) -> bool:
     if w.edge[b, x]:
         return True
     j = w.hole_of[x]
-    while j >= 0:
-        y = w.hole[j, 1]
-        j = w.hole[j, 2]
+    while j > 0:
+        y = w.hole[j - 1, 1]
+        j = w.hole[j - 1, 2]
         if w.edge[x, y] == 0 and w.edge[b, y] and w.edge[y, b] == 0:
             return True
     return False
@@ -566,7 +585,7 @@ def _is_loop(w: Workspace, b: int, x: int) -> bool:
 @kernel
 def _add_hole(w: Workspace, start: int, end: int, holes: int) -> int:
     w.hole[holes, 0], w.hole[holes, 1], w.hole[holes, 2] = start, end, w.hole_of[start]
-    w.hole_of[start] = holes
+    w.hole_of[start] = holes + 1
     return holes + 1
 
 

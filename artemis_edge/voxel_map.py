@@ -35,11 +35,11 @@ from artemis_edge.block_store import (
     VIEW,
     Store,
 )
-from artemis_edge.cell_code import CODES, OWN, code_in, code_of, gather_cells
+from artemis_edge.cell_code import CODES, NEAR_VOXELS, OWN, code_cell, code_in, code_of, gather_cells
 from artemis_edge.class_rows import are_two_objects
 from artemis_edge.config import VoxelMapConfig
 from artemis_edge.eigen3 import smallest_eigen3
-from artemis_edge.frames import F32, F64, I32, U8, TrackedFrame
+from artemis_edge.frames import F32, F64, I32, U32, TrackedFrame
 from artemis_edge.insertion import InsertRules, insert_points, new_chunk
 
 # A plane may be this much thicker than sigma^2: the noise of the angles adds to that of the range
@@ -124,8 +124,10 @@ class RefreshSpace(NamedTuple):
 
     neighbour: I32  # (27,)
     grid: I32  # (CODES,) slot, then local index; -1 where nothing
-    code: I32  # (216,)
-    slot: I32  # (216,)
+    code: U32  # (216,)
+    slot: U32  # (216,)
+    place: F32  # (216, 4) of the vertex where it is alive, else out of reach
+    around: U32  # (28,) local indices of the cells around the one being looked at
     moment: F64  # (217, 16) about the voxel's corner; the last row is scratch
     total: F64  # (16,)
     eigen: F64  # (6,)
@@ -137,8 +139,10 @@ def refresh_space() -> RefreshSpace:
     return RefreshSpace(
         neighbour=np.empty(27, np.int32),
         grid=np.full(CODES, -1, np.int32),
-        code=np.empty(1728, np.int32),
-        slot=np.empty(216, np.int32),
+        code=np.empty(1728, np.uint32),
+        slot=np.empty(216, np.uint32),
+        place=np.zeros((216, 4), np.float32),
+        around=np.empty(28, np.uint32),
         moment=np.zeros((217, 16)),
         total=np.empty(16),
         eigen=np.empty(6),
@@ -156,9 +160,11 @@ def refresh_voxel(store: Store, v: int, stamp: int, rules: RefreshRules, w: Refr
     bs.neighbours27(store, v, w.neighbour)
     n = gather_cells(store, w.neighbour, 1, w.grid, w.code)
     for i in range(n):
-        w.slot[i] = w.grid[w.code[i]]
+        s = w.grid[w.code[i]]
+        w.slot[i] = s
         w.grid[w.code[i]] = i
-        _move_moments(store.evidence, w.slot[i], w.code[i], rules.cell_m, w.moment, i)
+        _keep_place(store, s, w.place[i])
+        _move_moments(store.evidence, s, w.code[i], rules.cell_m, w.moment, i)
     _fit_wide(w.moment, n, w.total, w.eigen, w.wide)
     _turn_to_sensor(store, rules.cell_m, w)
     if w.total[0] >= rules.least_evidence:  # else no cell can have enough around it
@@ -177,7 +183,8 @@ def _refresh_cell(store: Store, v: int, i: int, stamp: int, rules: RefreshRules,
     state, s, code = store.state, w.slot[i], w.code[i]
     if state[s] == CARVED and not is_seen_through(store.evidence[s]):
         state[s] = EVIDENCE_ONLY
-    _sum_around(w.grid, code, w.moment, w.total)
+    around = list_around(w.grid, code, w.around)
+    _sum_around(w.moment, w.around, around, w.total)
     p = store.vertex[s]
     _fit_vertex(w.moment[i], w.total, w.wide, rules.plane_sigma_m, w.eigen, p)
     edge_m = 4 * rules.cell_m
@@ -185,16 +192,15 @@ def _refresh_cell(store: Store, v: int, i: int, stamp: int, rules: RefreshRules,
     p[POSITION + 1] += store.voxel[v, IY] * edge_m
     p[POSITION + 2] += store.voxel[v, IZ] * edge_m
     apart = rules.min_distance_m
-    if state[s] == ALIVE and _is_crowded(store, w, i, STAYS * apart):
+    if state[s] == ALIVE and _is_crowded(store, w, i, around, STAYS * apart):
         state[s] = EVIDENCE_ONLY
         _tell_neighbours(store, w.neighbour, code, AT_ONCE, stamp)
     elif (
-        state[s] == EVIDENCE_ONLY
-        and w.total[0] >= rules.least_evidence
-        and _is_apart(store.vertex, state, w.grid, w.slot, code, s, apart)
+        state[s] == EVIDENCE_ONLY and w.total[0] >= rules.least_evidence and _is_apart(w, i, around, p, apart)
     ):
         state[s] = ALIVE
         _tell_neighbours(store, w.neighbour, code, 1, stamp)
+    _keep_place(store, s, w.place[i])
 
 
 @kernel
@@ -219,17 +225,30 @@ def _move_moments(evidence: F32, s: int, code: int, cell_m: float, moment: F64, 
 
 
 @kernel
-def _sum_around(grid: I32, at: int, moment: F64, total: F64) -> None:
-    """Moments of the 3 x 3 x 3 cells around ``at``; 16 columns of which 13 are used fill whole vector registers."""
-    for q in range(16):
-        total[q] = 0.0
+def list_around(grid: I32, at: int, around: U32) -> int:
+    """Local indices of the cells of the 3 x 3 x 3 around code ``at`` that hold something; how many.
+
+    Each is written and kept if it is one: no branch for the processor to guess. ``around`` has room for one more.
+    """
+    n = 0
     for dx in range(-1, 2):
         for dy in range(-1, 2):
             for dz in range(-1, 2):
-                t = grid[at + (dx << 10) + (dy << 5) + dz]
-                if t >= 0:
-                    for q in range(16):
-                        total[q] += moment[t, q]
+                i = grid[np.uint32(at + (dx << 10) + (dy << 5) + dz)]
+                around[n] = i
+                n += i >= 0
+    return n
+
+
+@kernel
+def _sum_around(moment: F64, around: U32, n: int, total: F64) -> None:
+    """Moments of the ``n`` cells in ``around``; 16 columns of which 14 are used are whole cache lines."""
+    for q in range(16):
+        total[q] = 0.0
+    for j in range(n):
+        i = around[j]
+        for q in range(16):
+            total[q] += moment[i, q]
 
 
 @kernel
@@ -364,18 +383,11 @@ def _fit_vertex(own: F64, total: F64, wide: F64, plane_sigma_m: float, eigen: F6
 @kernel
 def _tell_neighbours(store: Store, neighbour: I32, code: int, news: int, stamp: int) -> None:
     """A vertex began or ceased to live in the own cell ``code``: voxels that have it in their margin must know."""
-    X, Y, Z = (code >> 10) & 3, (code >> 5) & 3, code & 3
-    for k in range(27):
-        u = neighbour[k]
-        if k == 13 or u < 0:
-            continue
-        dx, dy, dz = k // 9 - 1, (k // 3) % 3 - 1, k % 3 - 1
-        near = (
-            (dx == 0 or (dx < 0 and X == 0) or (dx > 0 and X == 3))
-            and (dy == 0 or (dy < 0 and Y == 0) or (dy > 0 and Y == 3))
-            and (dz == 0 or (dz < 0 and Z == 0) or (dz > 0 and Z == 3))
-        )
-        if near and store.voxel[u, bs.AT_MESH] > 0:
+    near = NEAR_VOXELS[code_cell(code)]
+    while near != 0:
+        u = neighbour[bs.lowest_bit(near)]
+        near &= near - np.uint64(1)
+        if u >= 0 and store.voxel[u, bs.AT_MESH] > 0:
             store.voxel[u, FRESH] += news
             bs.enqueue(store, u, stamp)
 
@@ -387,40 +399,42 @@ def is_seen_through(e: F32) -> bool:
 
 
 @kernel
-def _is_crowded(store: Store, w: RefreshSpace, own: int, distance: float) -> bool:
+def _keep_place(store: Store, s: int, place: F32) -> None:
+    """Where the vertex of cell ``s`` is, out of reach unless it is alive."""
+    if store.state[s] == ALIVE:
+        p = store.vertex[s]
+        place[0], place[1], place[2] = p[POSITION], p[POSITION + 1], p[POSITION + 2]
+    else:
+        place[0] = np.inf
+
+
+@kernel
+def _is_crowded(store: Store, w: RefreshSpace, own: int, around: int, distance: float) -> bool:
     """Whether a living vertex with more evidence is nearer to that of the gathered cell ``own`` than ``distance``."""
-    at, s, mine = w.code[own], w.slot[own], w.moment[own, 0]
+    s, mine = w.slot[own], w.moment[own, 0]
     p = store.vertex[s]
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                i = w.grid[at + (dx << 10) + (dy << 5) + dz]
-                if i < 0 or i == own:
-                    continue
-                other = w.slot[i]
-                q = store.vertex[other]
-                # the rarest first: the processor guesses it right
-                near = (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2 < distance * distance
-                if not near or store.state[other] != ALIVE or w.moment[i, 0] < mine:
-                    continue
-                if w.moment[i, 0] == mine and other > s:
-                    continue
-                # where two objects meet, their vertices may
-                if not are_two_objects(store.attribute[s], store.attribute[other]):
-                    return True
+    for j in range(around):
+        i = w.around[j]
+        if not _is_near(p, w.place[i], distance) or i == own or w.moment[i, 0] < mine:
+            continue
+        other = w.slot[i]
+        if w.moment[i, 0] == mine and other > s:
+            continue
+        # where two objects meet, their vertices may
+        if not are_two_objects(store.attribute[s], store.attribute[other]):
+            return True
     return False
 
 
 @kernel
-def _is_apart(vertex: F32, state: U8, grid: I32, slot: I32, at: int, s: int, min_distance: float) -> bool:
-    p = vertex[s]
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                i = grid[at + (dx << 10) + (dy << 5) + dz]
-                if i >= 0 and slot[i] != s and state[slot[i]] == ALIVE:
-                    q = vertex[slot[i]]
-                    gap = (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
-                    if gap < min_distance * min_distance:
-                        return False
+def _is_apart(w: RefreshSpace, own: int, around: int, p: F32, distance: float) -> bool:
+    """Whether no other living vertex is nearer to ``p``, that of the gathered cell ``own``, than ``distance``."""
+    for j in range(around):  # noqa: SIM110 (kernels have no generators)
+        if _is_near(p, w.place[w.around[j]], distance) and w.around[j] != own:
+            return False
     return True
+
+
+@kernel
+def _is_near(p: F32, q: F32, distance: float) -> bool:
+    return (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2 < distance * distance

@@ -284,9 +284,9 @@ def test_moments_of_27_cells_against_a_dictionary() -> None:
     for i, c in enumerate({tuple(rng.integers(11, 17, 3).tolist()) for _ in range(120)}):
         grid[cc.code_of(*c)] = i
         cells[c] = moment[i, :13]  # type: ignore[index]
-    total = np.empty(16)
+    total, around = np.empty(16), np.empty(28, np.uint32)
     for x, y, z in cells:
-        vm._sum_around(grid, cc.code_of(x, y, z), moment, total)
+        vm._sum_around(moment, around, vm.list_around(grid, cc.code_of(x, y, z), around), total)
         np.testing.assert_allclose(total[:13], naive.sum_around(cells, (x, y, z)))
 
 
