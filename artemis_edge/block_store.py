@@ -280,6 +280,17 @@ def neighbours27(store: Store, v: int, out: I32) -> None:
 
 
 @kernel
+def has_vertex(store: Store, v: int) -> bool:
+    """Whether a voxel has a living vertex."""
+    mask = store.voxel_mask[v]
+    while mask != 0:
+        if store.state[store.voxel_cell[v, lowest_bit(mask)]] == ALIVE:
+            return True
+        mask &= mask - np.uint64(1)
+    return False
+
+
+@kernel
 def set_patch(store: Store, v: int, buffer: NDArray[np.uint16], n: int) -> bool:
     """Replace the triangles of a voxel; False (nothing changed) when the triangle pool is full."""
     room = store.voxel[v, PATCH_ROOM]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from artemis_edge._jit import kernel
 from artemis_edge.block_store import Store, lowest_bit
-from artemis_edge.frames import I32
+from artemis_edge.frames import I32, U32
 
 CODES = 1 << 15  # the 16th bit of a stored code is the mesher's
 OWN = 12  # first own coordinate
@@ -50,7 +50,7 @@ def code_in(k: int, c: int) -> int:
 
 
 @kernel
-def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32) -> int:
+def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: U32) -> int:
     """Cells with evidence of a voxel (first) and within ``margin`` (0..4) cells around it.
 
     Writes ``grid[code] = slot`` and lists the codes; returns how many.
@@ -63,7 +63,17 @@ def gather_cells(store: Store, neighbour: I32, margin: int, grid: I32, code: I32
 
 
 @kernel
-def gather_voxel(store: Store, w: int, k: int, margin: int, grid: I32, code: I32, n: int) -> int:
+def cells_within(store: Store, w: int, margin: int, k: int) -> int:
+    """How many cells the part of ``gather_cells`` for one of the 27 voxels has."""
+    n, mask = 0, store.voxel_mask[w] & _WITHIN[margin, k]
+    while mask != 0:
+        mask &= mask - np.uint64(1)
+        n += 1
+    return n
+
+
+@kernel
+def gather_voxel(store: Store, w: int, k: int, margin: int, grid: I32, code: U32, n: int) -> int:
     """The part of ``gather_cells`` for one of the 27 voxels."""
     mask = store.voxel_mask[w] & _WITHIN[margin, k]
     while mask != 0:

@@ -144,7 +144,7 @@ def workspace() -> Workspace:
 @kernel
 def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace) -> bool:
     """Replace the patch of voxel ``v``; False when the triangle pool is full."""
-    if not _has_vertex(store, v):
+    if not bs.has_vertex(store, v):
         return bs.set_patch(store, v, w.patch, 0)  # without own vertices nothing is owned
     bs.neighbours27(store, v, w.neighbour)
     cells = gather_cells(store, w.neighbour, MARGIN_CELLS, w.grid, w.code)
@@ -179,17 +179,6 @@ def mesh_voxel(store: Store, v: int, voxel_m: float, rules: Rules, w: Workspace)
         if i >= plain:
             w.patch[i, 0] |= EAR
     return bs.set_patch(store, v, w.patch, triangles)
-
-
-@kernel
-def _has_vertex(store: Store, v: int) -> bool:
-    """Whether a voxel has a living vertex."""
-    mask = store.voxel_mask[v]
-    while mask != 0:
-        if store.state[store.voxel_cell[v, bs.lowest_bit(mask)]] == ALIVE:
-            return True
-        mask &= mask - np.uint64(1)
-    return False
 
 
 @kernel

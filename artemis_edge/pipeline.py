@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -180,7 +181,7 @@ class Pipeline:
             return
         with self._stage("segmentation"):
             for image, T_world_lidar in zip(tracked.images, tracked.image_poses, strict=True):
-                self.segmenter.offer(image, self.semantics.sight(image, T_world_lidar))
+                self.segmenter.offer(image, partial(self.semantics.sight, image, T_world_lidar))
 
     @property
     def warnings(self) -> list[str]:

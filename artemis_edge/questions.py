@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -93,9 +93,9 @@ class ScheduledMasks:
     names: Sequence[str]
     work: Scheduled[Sight]
 
-    def offer(self, image: CameraImage, sight: Sight) -> None:
+    def offer(self, image: CameraImage, look: Callable[[], Sight]) -> None:
         """An image that may be segmented."""
-        self.work.offer(image, sight)
+        self.work.offer(image, look)
 
     def ready(self) -> list[LateMask]:
         """Masks that are due in this frame."""
@@ -121,9 +121,9 @@ class BlankMasks:
     names: Sequence[str]
     _queue: deque[Sight] = field(default_factory=deque)
 
-    def offer(self, image: CameraImage, sight: Sight) -> None:
+    def offer(self, image: CameraImage, look: Callable[[], Sight]) -> None:
         """Take the view."""
-        self._queue.append(sight)
+        self._queue.append(look())
 
     def ready(self) -> list[LateMask]:
         """Two masks for every image at once: one as they come, and one as of an image from before its question."""

@@ -34,16 +34,15 @@ from artemis_edge.block_store import (
     WEIGHT,
     Store,
 )
-from artemis_edge.cell_code import CODES, OWN, code_of, code_voxel, gather_cells
+from artemis_edge.cell_code import CODES, OWN, cells_within, code_of, code_voxel, gather_cells
 from artemis_edge.class_rows import clear_class
 from artemis_edge.config import SemanticsConfig
-from artemis_edge.frames import F32, F64, I32, U8
+from artemis_edge.frames import F32, F64, I32, U8, U32
 from artemis_edge.paging import resident_blocks
 from artemis_edge.refinement.semantics import probabilities
 from artemis_edge.voxel_map import AT_ONCE
 
 MARGIN = 1  # cells around a voxel in which neighbours are looked for
-MOST = 216  # cells of a voxel and its margin
 # A clear class (class_rows.py) is an object's own, as far as triangles are concerned, when its voxel is so confident
 # (eq. 7)
 CONFIDENT_XI = 0.5
@@ -68,33 +67,64 @@ class Energy(NamedTuple):
 
 
 class Space(NamedTuple):
-    """Scratch: the living vertices of a voxel and its margin."""
+    """Scratch: the cells of a voxel and its margin."""
 
     neighbour: I32  # (27,)
     grid: I32  # (CODES,) slot, then row; -1 where nothing
-    code: I32  # (1728,)
-    slot: I32  # (m,)
-    where: I32  # (m,) code
-    own: I32  # (m,) row of the anchor, -1 for the margin's
-    P: F32  # (m, CLASSES) P_sem
-    best: I32  # (m,) most probable class
-    entropy: F64  # (m,)
-    xi: F64  # (m,) semantic confidence, eq. 7
+    code: U32  # (1728,)
+
+
+class Rows(NamedTuple):
+    """The living vertices of a batch's voxels and their margins, each once: what is known of them does not change
+    while they move."""
+
+    of: I32  # (cells,) row + 1 of a cell's vertex, 0 where it has none
+    slot: U32  # (n,)
+    P: F32  # (n, CLASSES) P_sem
+    best: I32  # (n,) most probable class
+    certain: I32  # (n,) class that it certainly has, -1 where none
+    entropy: F64  # (n,)
+    xi: F64  # (n,) semantic confidence, eq. 7
+
+
+class Own(NamedTuple):
+    """The vertices of the batch's voxels, which move, and N(v_i) of each."""
+
+    row: U32  # (m,)
+    voxel: U32  # (m,) slot
+    anchor: F32  # (m, 8) where the evidence puts it
+    start: U32  # (m + 1,) its neighbours are those from start[i] to start[i + 1]
+    other: U32  # (e,) row of a neighbour
+    sim: F64  # (e,) sim_semantic with it (eq. 5); -1 until it is needed
 
 
 def new_space() -> Space:
     """Fresh scratch memory."""
-    return Space(
-        neighbour=np.empty(27, np.int32),
-        grid=np.full(CODES, -1, np.int32),
-        code=np.empty(1728, np.int32),
-        slot=np.empty(MOST, np.int32),
-        where=np.empty(MOST, np.int32),
-        own=np.empty(MOST, np.int32),
-        P=np.empty((MOST, CLASSES), np.float32),
-        best=np.empty(MOST, np.int32),
-        entropy=np.empty(MOST),
-        xi=np.empty(MOST),
+    return Space(np.empty(27, np.int32), np.full(CODES, -1, np.int32), np.empty(1728, np.uint32))
+
+
+def new_rows(of: I32, room: int) -> Rows:
+    """Memory for ``room`` rows."""
+    return Rows(
+        of,
+        np.empty(room, np.uint32),
+        np.empty((room, CLASSES), np.float32),
+        np.empty(room, np.int32),
+        np.empty(room, np.int32),
+        np.empty(room),
+        np.empty(room),
+    )
+
+
+def new_own(room: int) -> Own:
+    """Memory for ``room`` vertices with 26 neighbours each."""
+    return Own(
+        np.empty(room, np.uint32),
+        np.empty(room, np.uint32),
+        np.empty((room, 8), np.float32),
+        np.empty(room + 1, np.uint32),
+        np.empty(26 * room + 1, np.uint32),  # one more: written before it is known whether it stays
+        np.empty(26 * room),
     )
 
 
@@ -116,7 +146,8 @@ class SemanticConstraint:
             sigma_m,
         )
         self._space = new_space()
-        self._anchor = np.empty((4096, 8), np.float32)
+        self._rows = new_rows(np.zeros(len(store.state), np.int32), 4096)
+        self._own = new_own(1024)
 
     @property
     def telling_apart(self) -> float:
@@ -144,79 +175,97 @@ class SemanticConstraint:
         """
         if not self._active[1:].any():
             return
-        room = int(count_cells(self._store, batch))
-        if room > len(self._anchor):
-            self._anchor = np.empty((2 * room, 8), np.float32)
-        first = np.empty(len(batch), np.int32)
-        keep_anchors(self._store, batch, first, self._anchor)
+        store, w = self._store, self._space
+        own, cells = count_cells(store, batch, w.neighbour)
+        if cells > len(self._rows.slot):
+            self._rows = new_rows(self._rows.of, 2 * cells)
+        if own > len(self._own.row):
+            self._own = new_own(2 * own)
+        rows, mine = self._rows, self._own
+        known, n = gather(store, batch, self.energy, self._active, w, rows, mine)
         for _ in range(min(self._sweeps, self.most_sweeps)):
-            sweep(self._store, batch, first, self._anchor, self.energy, self._active, self._space)
+            sweep(store, n, self.energy, rows, mine)
         if self.energy.lambda_sem > 0.0:
-            slide(self._store, batch, first, self._anchor, self.energy, self._active, self._space)
+            slide(store, n, self.energy, rows, mine)
+        rows.of[rows.slot[:known]] = 0
 
 
 @kernel
-def count_cells(store: Store, batch: I32) -> int:
-    """Most vertices that the voxels can have."""
-    n = 0
+def count_cells(store: Store, batch: I32, neighbour: I32) -> tuple[int, int]:
+    """Most vertices that the voxels can have, and with their margins; ``neighbour`` int32 (27,) is scratch."""
+    own = cells = 0
     for v in batch:
-        mask = store.voxel_mask[v]
-        while mask != 0:
-            mask &= mask - np.uint64(1)
-            n += 1
-    return n
+        own += cells_within(store, v, MARGIN, 13)
+        bs.neighbours27(store, v, neighbour)
+        for k in range(27):
+            if neighbour[k] >= 0:
+                cells += cells_within(store, neighbour[k], MARGIN, k)
+    return own, cells
 
 
 @kernel
-def keep_anchors(store: Store, batch: I32, first: I32, anchor: F32) -> None:
-    """Where the evidence puts the vertices: rows from ``first[k]`` on are those of the k-th voxel's cells."""
-    n = 0
-    for k in range(batch.shape[0]):
-        first[k] = n
-        mask = store.voxel_mask[batch[k]]
-        while mask != 0:
-            s = store.voxel_cell[batch[k], bs.lowest_bit(mask)]
-            mask &= mask - np.uint64(1)
+def gather(
+    store: Store, batch: I32, energy: Energy, active: U8, w: Space, rows: Rows, own: Own
+) -> tuple[int, int]:
+    """List the living vertices of the voxels and their margins; how many ``rows``, and how many move."""
+    known = n = edges = 0
+    for v in batch:
+        if not bs.has_vertex(store, v):
+            continue
+        bs.neighbours27(store, v, w.neighbour)
+        cells = gather_cells(store, w.neighbour, MARGIN, w.grid, w.code)
+        known = _number(store, cells, energy, active, w, rows, known)
+        for i in range(cells):
+            code = np.int64(w.code[i])
+            if ((code ^ _FIRST) & _NOT_OWN) != 0:
+                break  # own cells come first
+            row = w.grid[code]
+            if row < 0:
+                continue
+            own.row[n], own.voxel[n], own.start[n] = row, v, edges
             for q in range(8):
-                anchor[n, q] = store.vertex[s, q]
+                own.anchor[n, q] = store.vertex[rows.slot[row], q]
+            edges = _list_neighbours(w.grid, code, row, own.other, edges)
             n += 1
+        for i in range(cells):
+            w.grid[w.code[i]] = -1
+    own.start[n] = edges
+    own.sim[:edges] = -1.0
+    return known, n
 
 
 @kernel
-def gather(store: Store, v: int, first: int, energy: Energy, active: U8, w: Space) -> tuple[int, int]:
-    """Living vertices of a voxel (they come first) and its margin, with their distributions; how many, own, all.
-
-    ``grid[code]`` is then the row of a cell's vertex; :func:`release` empties it again.
-    """
-    bs.neighbours27(store, v, w.neighbour)
-    cells = gather_cells(store, w.neighbour, MARGIN, w.grid, w.code)
-    n = own = row = 0
+def _number(store: Store, cells: int, energy: Energy, active: U8, w: Space, rows: Rows, known: int) -> int:
+    """Put the row of each gathered cell's vertex into the grid, -1 where none lives; new ones are described."""
     for i in range(cells):
-        code = w.code[i]
+        code = np.int64(w.code[i])
         s = w.grid[code]
-        w.grid[code] = -1
-        is_own = ((code ^ _FIRST) & _NOT_OWN) == 0
-        if store.state[s] == ALIVE:
-            w.slot[n], w.where[n] = s, code
-            w.own[n] = first + row if is_own else -1
-            w.grid[code] = n
-            own += is_own
-            n += 1
-        row += is_own
-    for i in range(n if own > 0 else 0):
-        lam = store.attribute[w.slot[i], LOG_CLASS:]
-        w.best[i] = probabilities(lam, active, w.P[i])
-        w.entropy[i] = entropy(w.P[i])
-        weight = store.voxel_class[w.neighbour[code_voxel(w.where[i])], WEIGHT]
-        w.xi[i] = 1.0 - math.exp(-energy.rate * weight)  # eq. 7
-    return own, n
+        if store.state[s] != ALIVE:
+            w.grid[code] = -1
+            continue
+        if rows.of[s] == 0:
+            weight = store.voxel_class[w.neighbour[code_voxel(code)], WEIGHT]
+            rows.slot[known] = s
+            rows.best[known] = probabilities(store.attribute[s, LOG_CLASS:], active, rows.P[known])
+            rows.certain[known] = confident_class(store.attribute[s], weight, energy.rate)
+            rows.entropy[known] = entropy(rows.P[known])
+            rows.xi[known] = 1.0 - math.exp(-energy.rate * weight)  # eq. 7
+            known += 1
+            rows.of[s] = known
+        w.grid[code] = rows.of[s] - 1
+    return known
 
 
 @kernel
-def release(n: int, w: Space) -> None:
-    """Empty the grid."""
-    for i in range(n):
-        w.grid[w.where[i]] = -1
+def _list_neighbours(grid: I32, code: int, row: int, other: U32, n: int) -> int:
+    """Append the rows of the 3 x 3 x 3 cells around ``code`` but its own."""
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                j = grid[np.uint32(code + (dx << 10) + (dy << 5) + dz)]
+                other[n] = j
+                n += (j >= 0) & (j != row)
+    return n
 
 
 @kernel
@@ -241,7 +290,7 @@ def jensen_shannon(P: F32, Q: F32, entropy_P: float, entropy_Q: float) -> float:
 
 
 @kernel
-def similarity(i: int, j: int, energy: Energy, w: Space) -> float:
+def similarity(i: int, j: int, energy: Energy, rows: Rows) -> float:
     """sim_semantic of eq. 5.
 
     What is known of a vertex counts by its confidence: between vertices of which nothing is known there is no
@@ -250,26 +299,24 @@ def similarity(i: int, j: int, energy: Energy, w: Space) -> float:
     if not energy.sim:
         return 1.0
     sure = 0.99
-    if w.best[i] == w.best[j] and w.P[i, w.best[i]] > sure and w.P[j, w.best[j]] > sure:
+    best = rows.best[i]
+    if best == rows.best[j] and rows.P[i, best] > sure and rows.P[j, best] > sure:
         return 1.0
-    js = jensen_shannon(w.P[i], w.P[j], w.entropy[i], w.entropy[j])
-    return math.exp(-energy.tau * math.sqrt(w.xi[i] * w.xi[j] * js))
+    js = jensen_shannon(rows.P[i], rows.P[j], rows.entropy[i], rows.entropy[j])
+    return math.exp(-energy.tau * math.sqrt(rows.xi[i] * rows.xi[j] * js))
 
 
 @kernel
-def sweep(store: Store, batch: I32, first: I32, anchor: F32, energy: Energy, active: U8, w: Space) -> None:
-    """One Gauss-Seidel sweep: every vertex takes the least energy given the others as they are now."""
-    for k in range(batch.shape[0]):
-        own, n = gather(store, batch[k], first[k], energy, active, w)
-        for i in range(own):
-            _relax(store, i, anchor[w.own[i]], energy, w)
-        release(n, w)
+def sweep(store: Store, n: int, energy: Energy, rows: Rows, own: Own) -> None:
+    """One Gauss-Seidel sweep: each of the ``n`` vertices takes the least energy given the others as they are now."""
+    for i in range(n):
+        _relax(store, i, energy, rows, own)
 
 
 @kernel
-def _relax(store: Store, i: int, start: F32, energy: Energy, w: Space) -> None:
-    """Turn the normal of row ``i`` to the least of E_smoothness, then move it along it to the least of E_total."""
-    p, code = store.vertex[w.slot[i]], w.where[i]
+def _relax(store: Store, i: int, energy: Energy, rows: Rows, own: Own) -> None:
+    """Turn the normal of vertex ``i`` to the least of E_smoothness, then move it along it to the least of E_total."""
+    p, start = store.vertex[rows.slot[own.row[i]]], own.anchor[i]
     nx, ny, nz = np.float64(start[NORMAL]), np.float64(start[NORMAL + 1]), np.float64(start[NORMAL + 2])
     ax, ay, az = np.float64(start[POSITION]), np.float64(start[POSITION + 1]), np.float64(start[POSITION + 2])
     # evidence that does not lie on a plane says less about where the surface is and which way it faces
@@ -277,24 +324,21 @@ def _relax(store: Store, i: int, start: F32, energy: Energy, w: Space) -> None:
     trust = sigma2 / (sigma2 + start[ROUGHNESS] * start[ROUGHNESS])
     mx, my, mz = trust * nx, trust * ny, trust * nz
     top = bottom = 0.0
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                j = w.grid[code + (dx << 10) + (dy << 5) + dz]
-                if j < 0 or j == i:
-                    continue
-                q = store.vertex[w.slot[j]]
-                gx, gy, gz = np.float64(q[NORMAL]), np.float64(q[NORMAL + 1]), np.float64(q[NORMAL + 2])
-                if p[NORMAL] * gx + p[NORMAL + 1] * gy + p[NORMAL + 2] * gz < ONE_SURFACE:
-                    continue
-                ex, ey, ez = ax - q[POSITION], ay - q[POSITION + 1], az - q[POSITION + 2]
-                length = max(math.sqrt(ex * ex + ey * ey + ez * ez), 0.1 * energy.spacing_m)
-                w_geo = energy.spacing_m / length
-                w_smooth = energy.lambda_smooth * similarity(i, j, energy, w) * w_geo  # eq. 8
-                mx, my, mz = mx + w_smooth * gx, my + w_smooth * gy, mz + w_smooth * gz
-                across = nx * gx + ny * gy + nz * gz
-                top += w_smooth * (ex * gx + ey * gy + ez * gz) * across
-                bottom += w_smooth * across * across
+    for e in range(own.start[i], own.start[i + 1]):
+        q = store.vertex[rows.slot[own.other[e]]]
+        gx, gy, gz = np.float64(q[NORMAL]), np.float64(q[NORMAL + 1]), np.float64(q[NORMAL + 2])
+        if p[NORMAL] * gx + p[NORMAL + 1] * gy + p[NORMAL + 2] * gz < ONE_SURFACE:
+            continue
+        ex, ey, ez = ax - q[POSITION], ay - q[POSITION + 1], az - q[POSITION + 2]
+        length = max(math.sqrt(ex * ex + ey * ey + ez * ez), 0.1 * energy.spacing_m)
+        w_geo = energy.spacing_m / length
+        if own.sim[e] < 0.0:
+            own.sim[e] = similarity(own.row[i], own.other[e], energy, rows)
+        w_smooth = energy.lambda_smooth * own.sim[e] * w_geo  # eq. 8
+        mx, my, mz = mx + w_smooth * gx, my + w_smooth * gy, mz + w_smooth * gz
+        across = nx * gx + ny * gy + nz * gz
+        top += w_smooth * (ex * gx + ey * gy + ez * gz) * across
+        bottom += w_smooth * across * across
     length = math.sqrt(mx * mx + my * my + mz * mz)
     if length > 1e-9:
         p[NORMAL], p[NORMAL + 1], p[NORMAL + 2] = mx / length, my / length, mz / length
@@ -351,60 +395,51 @@ def classes_in(store: Store, v: int, rate: float) -> int:
 
 
 @kernel
-def slide(store: Store, batch: I32, first: I32, anchor: F32, energy: Energy, active: U8, w: Space) -> None:
+def slide(store: Store, n: int, energy: Energy, rows: Rows, own: Own) -> None:
     """Tangential motion under E_semantic: vertices beside another object go to where the two surfaces meet."""
-    for k in range(batch.shape[0]):
-        v = batch[k]
-        own, n = gather(store, v, first[k], energy, active, w)
-        for i in range(n if own > 0 else 0):
-            weight = store.voxel_class[w.neighbour[code_voxel(w.where[i])], WEIGHT]
-            w.best[i] = confident_class(store.attribute[w.slot[i]], weight, energy.rate)
-        for i in range(own):
-            if w.best[i] >= 0 and _slide_one(store, i, energy, w):
-                store.block[store.voxel[v, BLOCK], CHANGED] = max(
-                    store.block[store.voxel[v, BLOCK], CHANGED], 1
-                )
-        release(n, w)
+    for i in range(n):
+        if rows.certain[own.row[i]] >= 0 and _slide_one(store, i, energy, rows, own):
+            block = store.voxel[own.voxel[i], BLOCK]
+            store.block[block, CHANGED] = max(store.block[block, CHANGED], 1)
 
 
 @kernel
-def _slide_one(store: Store, i: int, energy: Energy, w: Space) -> bool:
-    """The mean of the ways to where the surface of row ``i`` meets those of other objects beside it."""
-    p, code = store.vertex[w.slot[i]], w.where[i]
+def _slide_one(store: Store, i: int, energy: Energy, rows: Rows, own: Own) -> bool:
+    """The mean of the ways to where the surface of vertex ``i`` meets those of other objects beside it."""
+    row = own.row[i]
+    p = store.vertex[rows.slot[row]]
     nx, ny, nz = np.float64(p[NORMAL]), np.float64(p[NORMAL + 1]), np.float64(p[NORMAL + 2])
     sx = sy = sz = total = 0.0
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                j = w.grid[code + (dx << 10) + (dy << 5) + dz]
-                if j < 0 or w.best[j] < 0 or w.best[j] == w.best[i]:
-                    continue
-                q = store.vertex[w.slot[j]]
-                ex, ey, ez = (
-                    np.float64(q[POSITION]) - p[POSITION],
-                    np.float64(q[POSITION + 1]) - p[POSITION + 1],
-                    np.float64(q[POSITION + 2]) - p[POSITION + 2],
-                )
-                away = ex * nx + ey * ny + ez * nz
-                tx, ty, tz = ex - away * nx, ey - away * ny, ez - away * nz
-                length = math.sqrt(tx * tx + ty * ty + tz * tz)
-                if length < 1e-6:
-                    continue
-                gx, gy, gz = np.float64(q[NORMAL]), np.float64(q[NORMAL + 1]), np.float64(q[NORMAL + 2])
-                share = _meeting(nx * gx + ny * gy + nz * gz, ex, ey, ez, gx, gy, gz, tx, ty, tz)
-                weight = energy.lambda_sem * w.xi[i] * w.xi[j] * energy.spacing_m / length  # eq. 6
-                sx, sy, sz = sx + weight * share * tx, sy + weight * share * ty, sz + weight * share * tz
-                total += weight
+    for k in range(own.start[i], own.start[i + 1]):
+        j = own.other[k]
+        if rows.certain[j] < 0 or rows.certain[j] == rows.certain[row]:
+            continue
+        q = store.vertex[rows.slot[j]]
+        ex, ey, ez = (
+            np.float64(q[POSITION]) - p[POSITION],
+            np.float64(q[POSITION + 1]) - p[POSITION + 1],
+            np.float64(q[POSITION + 2]) - p[POSITION + 2],
+        )
+        away = ex * nx + ey * ny + ez * nz
+        tx, ty, tz = ex - away * nx, ey - away * ny, ez - away * nz
+        length = math.sqrt(tx * tx + ty * ty + tz * tz)
+        if length < 1e-6:
+            continue
+        gx, gy, gz = np.float64(q[NORMAL]), np.float64(q[NORMAL + 1]), np.float64(q[NORMAL + 2])
+        share = _meeting(nx * gx + ny * gy + nz * gz, ex, ey, ez, gx, gy, gz, tx, ty, tz)
+        weight = energy.lambda_sem * rows.xi[row] * rows.xi[j] * energy.spacing_m / length  # eq. 6
+        sx, sy, sz = sx + weight * share * tx, sy + weight * share * ty, sz + weight * share * tz
+        total += weight
     if total == 0.0:
         return False
     sx, sy, sz = sx / total, sy / total, sz / total
     length = math.sqrt(sx * sx + sy * sy + sz * sz)
     if length < 1e-6:
         return False
-    k = min(1.0, 0.5 * energy.spacing_m / length)
-    p[POSITION] += k * sx
-    p[POSITION + 1] += k * sy
-    p[POSITION + 2] += k * sz
+    step = min(1.0, 0.5 * energy.spacing_m / length)
+    p[POSITION] += step * sx
+    p[POSITION + 1] += step * sy
+    p[POSITION + 2] += step * sz
     return True
 
 

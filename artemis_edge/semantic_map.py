@@ -6,7 +6,7 @@ Holds which class is in which slot and the scratch memory; the mathematics is in
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -59,8 +59,8 @@ class Segmenter(Protocol):
         """Classes asked for, from slot 1 on."""
         ...
 
-    def offer(self, image: CameraImage, sight: Sight) -> None:
-        """An image that may be segmented."""
+    def offer(self, image: CameraImage, look: Callable[[], Sight]) -> None:
+        """An image that may be segmented; ``look`` sees the map as it is now, which costs as much as a fusion."""
         ...
 
     def ready(self) -> list[LateMask]:

@@ -52,7 +52,7 @@ def test_gathered_cells_against_a_dictionary(margin: int) -> None:
         a, b, c = (q & 3 for q in cell)
         slots[cell] = bs.add_cell(store, v, a * 16 + b * 4 + c)  # type: ignore[index]
     own = int(store.block_voxel[bs.find_block(store, 0, 0, 0), 0])
-    neighbour, grid, code = np.empty(27, np.int32), np.full(cc.CODES, -1, np.int32), np.empty(1728, np.int32)
+    neighbour, grid, code = np.empty(27, np.int32), np.full(cc.CODES, -1, np.int32), np.empty(1728, np.uint32)
     bs.neighbours27(store, own, neighbour)
     n = cc.gather_cells(store, neighbour, margin, grid, code)
 

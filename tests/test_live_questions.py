@@ -100,7 +100,7 @@ def test_masks_wait_for_the_frame_of_their_image_and_lose_what_is_forgotten() ->
     masks.asked = asked(car=1, bench=2)
     masks.take(pack_mask("cam", SECOND, (*CAR, Prompt(2, "bench")), scores(1, 2)))
     assert masks.ready() == []
-    masks.offer(image(1.0), new_sight(CAMERA, np.eye(4)))
+    masks.offer(image(1.0), lambda: new_sight(CAMERA, np.eye(4)))
     masks.asked = asked(bench=2, tree=1)  # the slot of the car is another's
     (mask,) = masks.ready()
     assert mask.scores.slots == (0, 2) and mask.sight.depth.shape == new_sight(CAMERA, np.eye(4)).depth.shape
@@ -115,7 +115,7 @@ def test_masks_wait_for_the_frame_of_their_image_and_lose_what_is_forgotten() ->
 def test_no_frame_fuses_more_than_a_few() -> None:
     masks = LateMasks()
     masks.asked = asked(car=1)
-    masks.offer(image(1.0), new_sight(CAMERA, np.eye(4)))
+    masks.offer(image(1.0), lambda: new_sight(CAMERA, np.eye(4)))
     for _ in range(5):
         masks.take(pack_mask("cam", SECOND, CAR, scores(1)))
     assert [len(masks.ready()) for _ in range(4)] == [2, 2, 1, 0]
@@ -128,7 +128,7 @@ def test_of_old_images_the_view_is_kept_without_its_depth() -> None:
     masks = LateMasks()
     masks.asked = asked(car=1)
     for k in range(60):
-        masks.offer(image(k), new_sight(CAMERA, np.eye(4)))
+        masks.offer(image(k), lambda: new_sight(CAMERA, np.eye(4)))
     masks.take(pack_mask("cam", 3 * SECOND, CAR, scores(1)))
     (mask,) = masks.ready()
     assert mask.sight.depth.size == 0

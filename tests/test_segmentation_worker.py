@@ -221,14 +221,23 @@ def test_what_a_model_knows_is_told_by_its_manifest(backend: Backend, tmp_path: 
 def handed_over(
     worker: Scheduled[int], engine: SlowEngine | None, patience: Sequence[int]
 ) -> list[tuple[int, int]]:
-    """(turn, context) of all masks of 12 frames with an image each; the engine is done as ``patience`` says."""
-    out = []
+    """(turn, context) of all masks of 12 frames with an image each; the engine is done as ``patience`` says.
+
+    A context is made when the image is offered, and only where a mask will come back with it.
+    """
+    out, made = [], []
+
+    def context() -> int:
+        made.append(turn)
+        return turn
+
     for turn in range(1, 13):
         out += [(turn, seen.context) for seen in worker.ready()]
-        worker.offer(image(0.1 * turn), turn)
+        worker.offer(image(0.1 * turn), context)
         if engine is not None:
             engine.done = patience[turn % len(patience)]
     out += [(13, seen.context) for seen in worker.drain()]
+    assert made == [offered for _, offered in out]
     return out
 
 

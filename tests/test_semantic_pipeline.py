@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,8 +41,8 @@ class Corridor:
     def __init__(self) -> None:
         self._offered: list[tuple[Sight, int]] = []
 
-    def offer(self, image: CameraImage, sight: Sight) -> None:
-        self._offered.append((sight, image.stamp_ns))
+    def offer(self, image: CameraImage, look: Callable[[], Sight]) -> None:
+        self._offered.append((look(), image.stamp_ns))
 
     def ready(self) -> list[LateMask]:
         due, self._offered = self._offered[:-1], self._offered[-1:]

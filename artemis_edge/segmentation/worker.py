@@ -187,14 +187,14 @@ class Scheduled(Generic[Context]):
     _done: list[_Offer[Context]] = field(default_factory=list)
     _turn: int = 0
 
-    def offer(self, image: CameraImage, context: Context) -> None:
-        """An image that may be segmented."""
+    def offer(self, image: CameraImage, make_context: Callable[[], Context]) -> None:
+        """An image that may be segmented; what comes back with its mask is made now, and only if it is."""
         self.tally.offered += 1
         due = self.schedule(self._turn, image)
         if due is None or not self.prompts:
             self.tally.skipped += 1
             return
-        self._queue.append(_Offer(image, self.prompts, context, due))
+        self._queue.append(_Offer(image, self.prompts, make_context(), due))
         self._advance(wait=False)
 
     def settle(self) -> None:

@@ -15,7 +15,7 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -64,9 +64,9 @@ class StoredMasks:
     known: dict[int, DenseScores] = field(default_factory=dict)
     _queue: list[tuple[Sight, int]] = field(default_factory=list)
 
-    def offer(self, image: CameraImage, sight: Sight) -> None:
+    def offer(self, image: CameraImage, look: Callable[[], Sight]) -> None:
         """Take the view of an image."""
-        self._queue.append((sight, image.stamp_ns))
+        self._queue.append((look(), image.stamp_ns))
 
     def ready(self) -> list[LateMask]:
         """The masks of the images offered since."""

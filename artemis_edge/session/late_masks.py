@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +64,9 @@ class LateMasks:
             return
         self._waiting.append(_Waiting((message.header.frame_id, message.header.stamp_ns), prompts, scores))
 
-    def offer(self, image: CameraImage, sight: Sight) -> None:
+    def offer(self, image: CameraImage, look: Callable[[], Sight]) -> None:
         """The view of an image of the frame; of older images the view without its depth map is kept."""
-        self._views[image.name, image.stamp_ns] = sight
+        self._views[image.name, image.stamp_ns] = look()  # any image may get a mask
         recent = self._recent.setdefault(image.name, [])
         recent.append(image.stamp_ns)
         if len(recent) > _RECENT:
