@@ -1,12 +1,14 @@
 """``ask``: questions about a finished map, answered from its photographs without walking back.
 
 Every kept photograph is segmented for the classes of the questions, and its masks refine the vertices of the
-finished mesh by eqs 12 and 13, with occlusion by the depth of the mesh itself. The map on disk stays as it is.
+finished mesh by eqs 12 and 13, with occlusion by the depth that the map had when the photograph was taken; where it
+knew nothing then, the photograph tells nothing. Of maps made without that depth, occlusion is by the mesh itself.
+The map on disk stays as it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from artemis_edge.export.objects import object_mesh
 from artemis_edge.export.ply import find_mesh, read_mesh, write_ply
 from artemis_edge.frames import F32
 from artemis_edge.highlight import Reply, answer, objects_of
+from artemis_edge.map_view import visibility
 from artemis_edge.opened_map import map_folder
 from artemis_edge.progress import Report, say, silent
 from artemis_edge.questions import Questions, unanswered
@@ -30,8 +33,16 @@ from artemis_edge.segmentation.keyframes import Keyframe, read_keyframes, segmen
 from artemis_edge.segmentation.query import shown
 from artemis_edge.segmentation.registry import open_by_name
 from artemis_edge.segmentation.yolo_seg import Thresholds
-from artemis_edge.semantic_map import BACKGROUND, active_slots, slot_layers, spread_labels, visibility
-from artemis_edge.sight import cell_px, keep_visible, new_seen, new_sight, see_rows, splat_depth
+from artemis_edge.semantic_map import BACKGROUND, active_slots, slot_layers, spread_labels
+from artemis_edge.sight import (
+    cell_px,
+    hiding_the_unknown,
+    keep_visible,
+    new_seen,
+    new_sight,
+    see_rows,
+    splat_depth,
+)
 from artemis_edge.voxel_fusion import grid_of, sample_scores
 
 
@@ -55,10 +66,12 @@ def ask(
         return unanswered(questions, "nothing in it can be looked for")
     backend = open_by_name(questions.model, questions.thresholds, fine=True)
     brush = MeshBrush(mesh, questions.names, config.semantics, config.voxel_map.voxel_m / 4)
-    keyframes, refused = read_keyframes(folder), list[str]()
+    keyframes, refused, refused_depth = read_keyframes(folder), list[str](), list[str]()
     for keyframe, seen in segment_all(keyframes, backend, questions.prompts, report, refused.append):
-        brush.refine(keyframe, seen)
+        brush.refine(keyframe, seen, refused_depth.append)
     _tell_refused(refused, len(keyframes))
+    if refused_depth:
+        say(f"note: {len(refused_depth)} depth maps could not be used; the first: {refused_depth[0]}")
     report(len(keyframes), len(keyframes), "telling objects apart")
     labelled, probability = brush.labelled()
     replies = answer(questions.asked, objects_of(labelled, probability))
@@ -93,12 +106,22 @@ class MeshBrush:
         self._seen = new_seen(len(mesh.vertices))
         self._scratch = np.empty(CLASSES, np.float32)
 
-    def refine(self, keyframe: Keyframe, found: Segmentation) -> int:
-        """Eqs 12 and 13 for what a photograph sees; returns how many vertices it sees."""
+    def refine(
+        self, keyframe: Keyframe, found: Segmentation, refuse: Callable[[str], None] = lambda sentence: None
+    ) -> int:
+        """Eqs 12 and 13 for what a photograph sees; returns how many vertices it sees.
+
+        ``refuse`` is told where the depth that was kept with it cannot be used.
+        """
         sight, seen, dense = new_sight(keyframe.model, keyframe.T_world_cam), self._seen, found.dense
+        size, depth = cell_px(sight.lens), keyframe.known_depth(sight.lens, refuse)
         n = int(see_rows(self._rows, sight.T_cam_world, sight.lens, self._config.reach_m, seen))
-        splat_depth(seen, n, sight.lens[0], self._spacing_m, cell_px(sight.lens), sight.depth)
-        n = int(keep_visible(seen, n, cell_px(sight.lens), sight.depth, visibility(self._config)))
+        if depth.size > 0:
+            depth = hiding_the_unknown(depth)
+        else:
+            depth = sight.depth
+            splat_depth(seen, n, sight.lens[0], self._spacing_m, size, depth)
+        n = int(keep_visible(seen, n, size, depth, visibility(self._config)))
         sampled = np.empty((n, dense.score.shape[2]), np.float32)
         sample_scores(seen, n, dense.score, grid_of(dense), sampled)
         refine_rows(self._attribute, seen, n, sampled, slot_layers(dense), seen.reliability, self._scratch)

@@ -13,19 +13,24 @@ from typing import Protocol
 import numpy as np
 
 from artemis_edge.config import KeepConfig, SegmentationConfig
-from artemis_edge.frames import F32, F64, LidarScan, SyncedFrame, TrackedFrame, Trajectory
+from artemis_edge.frames import F32, F64, CameraModel, LidarScan, SyncedFrame, TrackedFrame, Trajectory
 from artemis_edge.kept_images import ImageSpool
 from artemis_edge.kept_points import PointSpool, open_points
-from artemis_edge.segmentation.keyframes import KeyframeStore, photographs
+from artemis_edge.segmentation.keyframes import KeyframeStore
+from artemis_edge.sight import Sight
 from artemis_edge.trajectory import inverse
 
 Prepare = Callable[[SyncedFrame], SyncedFrame]
 
 
 class Tracker(Protocol):
-    """What the keeper needs of the pipeline: the last frame that was tracked."""
+    """What the keeper needs of the pipeline: the last frame that was tracked, and the depth of the map after it."""
 
     tracked: TrackedFrame | None
+
+    def sight(self, camera: CameraModel, T_world_cam: F64) -> Sight:
+        """The view of a camera with the reference depth that the map has now."""
+        ...
 
 
 class Keeper:
@@ -51,8 +56,7 @@ class Keeper:
             self._points.take_over(points)
         self._images.take_over(folder)
         if self._keyframes is not None:
-            for image, T_world_cam in photographs(folder):
-                self._keyframes.offer(image, T_world_cam)
+            self._keyframes.take_over(folder)
 
     def between(self, prepare: Prepare, tracker: Tracker) -> Prepare:
         """``prepare``, which is called before every frame, after what the last frame brought is written."""
@@ -69,23 +73,24 @@ class Keeper:
         """Write what the last frame brought, if it could be tracked."""
         if self._pending is None:
             return
-        frame, tracked = self._pending[0], self._pending[1].tracked
-        self._pending = None
+        frame, mapper = self._pending
+        tracked, self._pending = mapper.tracked, None
         if tracked is None or tracked.index != frame.index:
             return
         for image in frame.images:
             self._images.add(image)
-        self._offer_keyframes(tracked)
+        self._offer_keyframes(tracked, mapper)
         for scan, moved in zip(frame.scans, tracked.scans, strict=True):
             time_s, intensity = _of_rows(scan, len(moved.points))
             points = _to_world(moved.points, tracked.T_world_lidar)
             self._points.add(points, scan.stamp_ns, time_s, intensity)
 
-    def _offer_keyframes(self, tracked: TrackedFrame) -> None:
-        """Images whose pose is known."""
+    def _offer_keyframes(self, tracked: TrackedFrame, mapper: Tracker) -> None:
+        """Images whose pose is known, with the depth that the map has at their time."""
         if self._keyframes is not None and tracked.image_poses:
             for image, T_world_lidar in zip(tracked.images, tracked.image_poses, strict=True):
-                self._keyframes.offer(image, T_world_lidar @ inverse(image.T_cam_lidar))
+                T_world_cam = T_world_lidar @ inverse(image.T_cam_lidar)
+                self._keyframes.offer(image, T_world_cam, mapper.sight)
 
     def after_copy(self) -> None:
         """In a copy of the process that takes over (service/checkpoint.py): as the files are now."""

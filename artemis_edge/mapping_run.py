@@ -18,12 +18,23 @@ from artemis_edge import health
 from artemis_edge.errors import InputError, RunError, UserError
 from artemis_edge.export.atomic import disk_sentence
 from artemis_edge.export.ply import Mesh
-from artemis_edge.frames import F32, F64, FrameSource, MeshDelta, SyncedFrame, TrackedFrame, Trajectory
+from artemis_edge.frames import (
+    F32,
+    F64,
+    CameraModel,
+    FrameSource,
+    MeshDelta,
+    SyncedFrame,
+    TrackedFrame,
+    Trajectory,
+)
 from artemis_edge.load import Load
 from artemis_edge.paging import Page
 from artemis_edge.progress import Report, now_and_then, say
 from artemis_edge.refinement.photographs import Waiting
 from artemis_edge.session.statistics import RunStatistics
+from artemis_edge.sight import Sight
+from artemis_edge.trajectory import inverse
 
 Publish = Callable[[MeshDelta], None]
 
@@ -78,6 +89,10 @@ class Mapper(Protocol):
 
     def reduce(self, load: Load) -> None:
         """How much may be done from the next frame on."""
+        ...
+
+    def sight(self, camera: CameraModel, T_world_cam: F64) -> Sight:
+        """The view of a camera with the reference depth that the map has now."""
         ...
 
     def tell_everything(self) -> None:
@@ -243,6 +258,8 @@ def warm_up(make: Callable[[], Mapper], source: FrameSource, span: range, frames
         mapper = make()
         for frame in source.frames(span.start, min(span.start + frames, span.stop)):
             mapper.process(frame)
+            for image in frame.images[:1]:
+                mapper.sight(image.model, inverse(image.T_cam_lidar))
         mapper.finish()
     except (UserError, OSError):
         pass  # the run itself will meet the same fault and count it

@@ -16,9 +16,10 @@ from artemis_edge.config import Config
 from artemis_edge.delta import Outbox
 from artemis_edge.export.atlas import write_atlas
 from artemis_edge.export.mesh import Mesh
-from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
+from artemis_edge.frames import F32, F64, CameraModel, MeshDelta, Odometry, SyncedFrame, TrackedFrame
 from artemis_edge.known_lenses import write_lenses
 from artemis_edge.load import Load
+from artemis_edge.map_view import MapView
 from artemis_edge.map_writer import save_map, write_mesh, write_removed
 from artemis_edge.mesher import Mesher
 from artemis_edge.paging import TIGHT, Page, Pager, with_attributes
@@ -26,6 +27,7 @@ from artemis_edge.refinement.photographs import Waiting
 from artemis_edge.refinement.stage import GoOn, Refinement, always
 from artemis_edge.semantic_constraint import SemanticConstraint
 from artemis_edge.semantic_map import Segmenter, SemanticMap
+from artemis_edge.sight import Sight
 from artemis_edge.visibility import FreeSpace
 from artemis_edge.voxel_map import VoxelMap
 
@@ -48,6 +50,7 @@ class Pipeline:
         budget = (config.voxel_map.memory_budget_mb - BASE_MB) * 1e6
         self.voxel_map = VoxelMap(config.voxel_map, budget, LOG_CLASS + (CLASSES if segmenter else 0))
         self.semantics = self._semantics() if segmenter else None
+        self._view = self.semantics.view if self.semantics else self._looking()
         self.free_space = FreeSpace(config.voxel_map, self.voxel_map)
         self.refinement = Refinement(config.refinement, self.voxel_map, budget, page_folder)
         self.pager = Pager(self.voxel_map.store, page_folder, self.refinement.pages)
@@ -109,6 +112,10 @@ class Pipeline:
         if self.constraint is not None:
             self.constraint.most_sweeps = load.most_sweeps
 
+    def sight(self, camera: CameraModel, T_world_cam: F64) -> Sight:
+        """The view of a camera with the reference depth that the map has now."""
+        return self._view.sight(camera, T_world_cam)
+
     def tell_everything(self) -> None:
         """A viewer is new: all blocks in memory are told again, as the coming frames have room."""
         self.voxel_map.store.block[self.pager.resident(), CHANGED] = 1
@@ -145,6 +152,9 @@ class Pipeline:
         if last is not None:
             with self._stage("refinement"):
                 self.refinement.update(last, self._stamp)
+
+    def _looking(self) -> MapView:
+        return MapView(self.config.semantics, self.voxel_map.store, self.config.voxel_map.voxel_m)
 
     def _semantics(self) -> SemanticMap:
         assert self.segmenter is not None

@@ -19,25 +19,14 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.mesh import edges_of
 from artemis_edge.forgetting import Forgotten, forget_blocks
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraImage
+from artemis_edge.map_view import MapView, visibility
 from artemis_edge.paging import resident_blocks
 from artemis_edge.refinement.agreement import agreed
-from artemis_edge.refinement.semantics import LEAST_RELIABILITY, labels_of, refine
+from artemis_edge.refinement.semantics import labels_of, refine
 from artemis_edge.segmentation.backend import DenseScores
-from artemis_edge.sight import (
-    DEPTH,
-    Sight,
-    Visibility,
-    cell_px,
-    empty_depth,
-    keep_visible,
-    look,
-    new_seen,
-    new_sight,
-    splat_depth,
-    without_depth,
-)
+from artemis_edge.sight import Sight, cell_px, filled, keep_visible, new_sight, without_depth
 from artemis_edge.trajectory import inverse
-from artemis_edge.voxel_fusion import MOST_SIGMAS, fuse, grid_of, sample_scores, start_from
+from artemis_edge.voxel_fusion import fuse, grid_of, sample_scores, start_from
 
 BACKGROUND = "background"
 _SAME_SURFACE = 0.7  # cosine between normals
@@ -81,10 +70,9 @@ class SemanticMap:
         self.names: dict[int, str] = {0: BACKGROUND}
         self.active = np.zeros(CLASSES, np.uint8)
         self.active[0] = 1
-        self._block_m = 8 * voxel_m
+        self.view = MapView(config, store, voxel_m)
         self._spacing_m = voxel_m / 4
-        self._blocks = np.empty(len(store.block), np.int32)
-        self._seen = new_seen(len(store.state))
+        self._seen = self.view.seen
         self._sampled = np.empty((len(store.state), CLASSES), np.float32)
         self._scratch = np.empty(CLASSES, np.float32)
         self.probability = np.empty(0, np.float32)
@@ -110,7 +98,8 @@ class SemanticMap:
         if not gone.any():
             return None
         forgotten = Forgotten(gone, self.active.copy())
-        blocks = self._blocks[: resident_blocks(self.store, self._blocks)]
+        blocks = np.empty(len(self.store.block), np.int32)
+        blocks = blocks[: resident_blocks(self.store, blocks)]
         forget_blocks(self.store, blocks, gone, forgotten.active, stamp)
         return forgotten
 
@@ -127,22 +116,15 @@ class SemanticMap:
 
     def sight(self, image: CameraImage, T_world_lidar: F64) -> Sight:
         """The view of an image with the reference depth that the map has now; without one where nothing is asked."""
-        view = new_sight(image.model, T_world_lidar @ inverse(image.T_cam_lidar))
+        T_world_cam = T_world_lidar @ inverse(image.T_cam_lidar)
         if not self.asked:
-            return without_depth(view)
-        n = self._look(without_depth(view))
-        splat_depth(self._seen, n, view.lens[0], self._spacing_m, cell_px(view.lens), view.depth)
-        return view
+            return without_depth(new_sight(image.model, T_world_cam))
+        return self.view.sight(image.model, T_world_cam)
 
     def fuse(self, mask: LateMask, stamp: int) -> int:
         """Voxel fusion (eq. 1) of a mask; returns how many vertices it sees."""
-        n, lens, then = self._look(mask.sight), mask.sight.lens, mask.sight.depth
-        # where the map knew nothing when the image was taken, what stood in the way is what it knows now
-        depth = empty_depth(lens)
-        splat_depth(self._seen, n, lens[0], self._spacing_m, cell_px(lens), depth)
-        if then.size > 0:
-            known = then[:, :, DEPTH] < np.inf
-            depth[known] = then[known]
+        n, lens = self.view.look(mask.sight), mask.sight.lens
+        depth = filled(mask.sight.depth, self.view.depth(n, lens))
         n = int(keep_visible(self._seen, n, cell_px(lens), depth, visibility(self.config)))
         sampled = self._rows(n, mask.scores)
         sample_scores(self._seen, n, mask.scores.score, grid_of(mask.scores), sampled)
@@ -186,19 +168,9 @@ class SemanticMap:
         self.probability = probability
         return spread_labels(label, probability > 0.0, normals, faces, self.config.spread_rings)
 
-    def _look(self, sight: Sight) -> int:
-        blocks = self._blocks[: resident_blocks(self.store, self._blocks)]
-        rules = visibility(self.config)
-        return look(self.store, sight, blocks, self._block_m, self.config.reach_m, rules, self._seen)
-
     def _rows(self, n: int, scores: DenseScores) -> F32:
         layers = scores.score.shape[2]
         return self._sampled.reshape(-1)[: n * layers].reshape(n, layers)
-
-
-def visibility(config: SemanticsConfig) -> Visibility:
-    """When a vertex is what its pixel shows: for eq. 1 by sigma_d, for eqs 12 and 13 by W."""
-    return Visibility(config.sigma_geom, LEAST_RELIABILITY, MOST_SIGMAS * config.sigma_d_m)
 
 
 def slot_layers(scores: DenseScores) -> I32:

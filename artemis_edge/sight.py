@@ -32,6 +32,7 @@ _FARTHEST = 2.0
 LEAST_COSINE = 0.05
 # Depth errors of so many sigma_geom weigh nothing (below 4e-6): spares the exponential
 _NO_WEIGHT = 5.0
+_IN_THE_WAY_M = 1e-3
 _SPLAT = 0.75  # radius of a splat in point spacings: neighbouring splats overlap and leave no hole
 
 
@@ -109,6 +110,24 @@ def empty_depth(lens: F64) -> F32:
 def without_depth(sight: Sight) -> Sight:
     """The view alone: some hundred bytes, of which thousands can be kept."""
     return sight._replace(depth=np.empty((0, 0, 4), np.float32))
+
+
+def filled(then: F32, now: F32) -> F32:
+    """The depth map of an image's time, and where nothing was known ``then`` (it may be empty), what is known ``now``.
+
+    Where the map knew nothing when the image was taken, what stood in the way is what it knows now.
+    """
+    if then.size == 0:
+        return now
+    return np.where(then[:, :, DEPTH, None] < np.inf, then, now)
+
+
+def hiding_the_unknown(depth: F32) -> F32:
+    """The depth map with something right before the camera wherever nothing is known: what is there tells nothing."""
+    unknown = depth[:, :, DEPTH] == np.inf
+    out = depth.copy()
+    out[unknown] = _IN_THE_WAY_M, 1.0 / _IN_THE_WAY_M, 0.0, 0.0
+    return out
 
 
 def look(

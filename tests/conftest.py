@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from artemis_edge.export.ply import Mesh, bare_mesh, write_ply
-from artemis_edge.frames import F32, F64, MeshDelta, Odometry, SyncedFrame, TrackedFrame
+from artemis_edge.frames import F32, F64, CameraModel, MeshDelta, Odometry, SyncedFrame, TrackedFrame
 from artemis_edge.load import Load
 from artemis_edge.refinement.stage import GoOn, always
+from artemis_edge.sight import Sight, new_sight
 
 # In this order, before all others: what compiles kernels that many need, and beside it what needs none of them; then
 # files that take long, so that no worker waits for the other's last one; those at the LiDAR's ports apart.
@@ -74,6 +75,9 @@ class FakeMapper:
 
     def reduce(self, load: Load) -> None:
         self.load = load
+
+    def sight(self, camera: CameraModel, T_world_cam: F64) -> Sight:
+        return new_sight(camera, T_world_cam)
 
     def tell_everything(self) -> None:
         pass

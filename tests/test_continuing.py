@@ -45,6 +45,7 @@ from artemis_edge.session.message_ring import MessageRing
 from artemis_edge.session.stream_mapping import StreamMapping
 from artemis_edge.session.stream_search import StreamSearch
 from artemis_edge.session.writer import SessionWriter
+from artemis_edge.sight import new_sight
 from artemis_edge.trajectory import read_tum
 from tests import box_world
 from tests.conftest import FakeMapper
@@ -328,7 +329,7 @@ def test_points_and_photographs_of_the_earlier_map_stay(tmp_path: Path) -> None:
         frame = SyncedFrame(run, 0, (scan,), (image,))
         moved = (DeskewedScan(scan.points, np.zeros(3)),)
         tracked = TrackedFrame(run, 0, np.eye(4), moved, images=(image,), image_poses=(T,))
-        keeper.between(lambda frame: frame, SimpleNamespace(tracked=tracked))(frame)
+        keeper.between(lambda frame: frame, SimpleNamespace(tracked=tracked, sight=new_sight))(frame)
         keeper.save(folder, poses)
     kept = open_points(folders[1])
     assert kept is not None and kept.rows == 6

@@ -25,6 +25,7 @@ from artemis_edge.kept_images import INDEX
 from artemis_edge.kept_points import FULL_INTENSITY, open_points
 from artemis_edge.runtime import Request, reprocess
 from artemis_edge.segmentation.keyframes import read_keyframes
+from artemis_edge.sight import Sight, new_sight
 from tests.conftest import FakeMapper
 
 CAMERA = CameraModel(40, 30, 30.0, 30.0, 20.0, 15.0)
@@ -131,7 +132,13 @@ def test_a_frame_that_could_not_be_tracked_brings_nothing(tmp_path: Path) -> Non
 
 
 class Posed(Forward):
-    """Knows the poses of the images too."""
+    """Knows the poses of the images too, and that a wall is 3 m before each."""
+
+    def sight(self, camera: CameraModel, T_world_cam: np.ndarray) -> Sight:
+        assert self.tracked is not None and T_world_cam[0, 3] == self.tracked.T_world_lidar[0, 3]
+        view = new_sight(camera, T_world_cam)
+        view.depth[:] = 3.0, 1 / 3.0, 0.0, 0.0
+        return view
 
     def track(self, frame: SyncedFrame) -> TrackedFrame:
         tracked = super().track(frame)
@@ -151,3 +158,5 @@ def test_keyframes_are_kept_where_they_show_something_new(tmp_path: Path) -> Non
     assert [item.stamp_ns // 10**8 for item in found] == [0, 2, 4]
     np.testing.assert_allclose(found[1].T_world_cam[:3, 3], [1.0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(found[1].T_world_cam[:3, 2], [1.0, 0, 0], atol=1e-12)  # looks along x
+    lens = new_sight(CAMERA, np.eye(4)).lens
+    assert all(np.allclose(item.known_depth(lens, pytest.fail)[:, :, 0], 3.0, rtol=0.002) for item in found)

@@ -1,7 +1,8 @@
 """Photographs kept with a map, so that a later question is answered without walking back.
 
-``map/keyframes/`` holds them still encoded, with an ``index.json`` of the form of PHOTOS.json. What is kept is what
-was seen from elsewhere or towards elsewhere; where they grow beyond their budget, from farther apart.
+``map/keyframes/`` holds them still encoded, with an ``index.json`` of the form of PHOTOS.json, and beside each the
+depth that the map had in its view when it was taken (depth_file.py). What is kept is what was seen from elsewhere or
+towards elsewhere; where they grow beyond their budget, from farther apart.
 """
 
 from __future__ import annotations
@@ -9,28 +10,37 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from artemis_edge.config import SegmentationConfig
+from artemis_edge.depth_file import decode_depth, encode_depth
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
-from artemis_edge.frames import F64, U8, CameraImage, CameraModel
+from artemis_edge.frames import F32, F64, U8, CameraImage, CameraModel
 from artemis_edge.json_file import read_json
 from artemis_edge.progress import Report, silent
 from artemis_edge.segmentation.backend import Backend, Prompt, Segmentation
 from artemis_edge.segmentation.trial import decode
+from artemis_edge.sight import Sight
 from artemis_edge.trajectory import inverse
 
 FOLDER = "keyframes"
 INDEX = "index.json"
 #: What other parts of the program may have kept of a map's photographs, in the same form.
 _OTHER_INDEX = "images.json"
+_DEPTH = "_depth.png"
+# A camera that moved less than this share of what makes a view another one stands still
+_STILL = 0.25
+_RENEW_NS = 1_000_000_000
 _THINNING = 1.4  # the distance grows by this factor, the number falls to about half
 _MB = 1_000_000
+
+#: The view of a camera from a pose T_world_cam with the reference depth that the map has now.
+Look = Callable[[CameraModel, F64], Sight]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +60,14 @@ class _Kept:
     image: CameraImage  # without its bytes
     T_world_cam: F64
     file: str
-    size: int
+    depth: str  # file; empty: none
+    size: int  # of both
+    looked_ns: int | None  # when the map was asked for its depth last; None: it is not to be asked
+
+    @property
+    def files(self) -> list[str]:
+        """The names of its files."""
+        return [self.file, self.depth] if self.depth else [self.file]
 
 
 @dataclass(slots=True)
@@ -80,33 +97,74 @@ class KeyframeStore:
         """Bytes on disk."""
         return sum(kept.size for kept in self._kept)
 
-    def offer(self, image: CameraImage, T_world_cam: F64) -> bool:
-        """Keep a photograph if it shows what none kept shows; says whether it was kept."""
+    def offer(self, image: CameraImage, T_world_cam: F64, look: Look | None = None) -> bool:
+        """Keep a photograph if it shows what none kept shows; says whether it was kept.
+
+        ``look`` gives a view with the reference depth that the map has now, which is kept with the photograph.
+        While the camera stands still it is renewed: the map learns of a view that needs no other photograph.
+        """
         self.offered += 1
         if not image.encoded or not np.isfinite(T_world_cam).all():
             return False
-        if not is_new(self._views(image.name), T_world_cam, self.apart):
-            return False
+        if is_new(self._views(image.name), T_world_cam, self.apart):
+            depth = b"" if look is None else _seen_by(look, image.model, T_world_cam)
+            return self._keep(image, T_world_cam, depth, image.stamp_ns if look else None)
+        if look is not None:
+            self._renew(image, T_world_cam, look)
+        return False
+
+    def take_over(self, map_folder: Path) -> None:
+        """Begin with the photographs of a map made before, and their depth."""
+        for keyframe, image in _readable(map_folder):
+            self.offered += 1
+            if is_new(self._views(image.name), keyframe.T_world_cam, self.apart):
+                self._keep(image, keyframe.T_world_cam, _content(keyframe.depth), None)
+
+    def _keep(self, image: CameraImage, T_world_cam: F64, depth: bytes, looked_ns: int | None) -> bool:
         suffix = "png" if image.encoded.startswith(b"\x89PNG") else "jpg"
         bare = CameraImage(image.name, image.stamp_ns, b"", image.model, image.T_cam_lidar, image.exposure_s)
-        kept = _Kept(bare, T_world_cam, f"{image.name}_{self.offered:06d}.{suffix}", len(image.encoded))
+        stem, size = f"{image.name}_{self.offered:06d}", len(image.encoded) + len(depth)
+        kept = _Kept(
+            bare, T_world_cam, f"{stem}.{suffix}", f"{stem}{_DEPTH}" if depth else "", size, looked_ns
+        )
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / kept.file).write_bytes(image.encoded)  # scratch: no need to wait for the disk
+        if depth:
+            (self.folder / kept.depth).write_bytes(depth)
         self._kept.append(kept)
+        self._keep_budget()
+        return any(item is kept for item in self._kept)
+
+    def _renew(self, image: CameraImage, T_world_cam: F64, look: Look) -> None:
+        """The depth of the camera's last photograph, if the camera still stands where it was taken."""
+        of_camera = (k for k in range(len(self._kept) - 1, -1, -1) if self._kept[k].image.name == image.name)
+        if (k := next(of_camera, None)) is None:
+            return
+        last = self._kept[k]
+        if last.looked_ns is None or image.stamp_ns - last.looked_ns < _RENEW_NS:
+            return
+        if is_new([last.T_world_cam], T_world_cam, self.apart.scaled(_STILL)):
+            return
+        depth, path = _seen_by(look, last.image.model, last.T_world_cam), self.folder / last.depth
+        size = last.size + len(depth) - path.stat().st_size
+        path.write_bytes(depth)
+        self._kept[k] = replace(last, size=size, looked_ns=image.stamp_ns)
+        self._keep_budget()
+
+    def _keep_budget(self) -> None:
         while self.size > self.budget_bytes and self._kept:
             self._thin()
-        return any(item is kept for item in self._kept)
 
     def after_copy(self) -> None:
         """In a copy of the process that takes over: the other may have thinned out the photographs."""
-        self._kept = [kept for kept in self._kept if (self.folder / kept.file).exists()]
+        self._kept = [k for k in self._kept if all((self.folder / name).exists() for name in k.files)]
 
     def save(self, map_folder: Path) -> int:
         """Move them into ``map/keyframes`` and write the index; returns bytes written."""
         into = map_folder / FOLDER
         into.mkdir(parents=True, exist_ok=True)
-        for kept in self._kept:
-            (self.folder / kept.file).replace(into / kept.file)
+        for name in (name for kept in self._kept for name in kept.files):
+            (self.folder / name).replace(into / name)
         content = (json.dumps({"photos": [_entry(kept) for kept in self._kept]}, indent=1) + "\n").encode()
         write_bytes(into / INDEX, content)
         return self.size + len(content)
@@ -122,11 +180,15 @@ class KeyframeStore:
             if is_new(self._views(kept.image.name), kept.T_world_cam, self.apart):
                 self._kept.append(kept)
             else:
-                (self.folder / kept.file).unlink()
+                self._delete(kept)
         if len(before) == 1:  # one photograph beyond the budget
             for kept in self._kept:
-                (self.folder / kept.file).unlink()
+                self._delete(kept)
             self._kept = []
+
+    def _delete(self, kept: _Kept) -> None:
+        for name in kept.files:
+            (self.folder / name).unlink(missing_ok=True)
 
 
 def is_new(views: Sequence[F64], T_world_cam: F64, apart: Apart) -> bool:
@@ -139,10 +201,21 @@ def is_new(views: Sequence[F64], T_world_cam: F64, apart: Apart) -> bool:
     return bool(np.all(moved / apart.metres + turned / apart.radians >= 1.0))
 
 
+def _seen_by(look: Look, camera: CameraModel, T_world_cam: F64) -> bytes:
+    sight = look(camera, T_world_cam)
+    return encode_depth(sight.depth, sight.lens)
+
+
+def _content(path: Path | None) -> bytes:
+    """Of a file; nothing where it is not there."""
+    return path.read_bytes() if path is not None and path.is_file() else b""
+
+
 def _entry(kept: _Kept) -> dict[str, Any]:
     model = kept.image.model
     return {
         "file": kept.file,
+        **({"depth": kept.depth} if kept.depth else {}),
         "camera": kept.image.name,
         "stamp_ns": kept.image.stamp_ns,
         "width": model.width,
@@ -158,13 +231,27 @@ def _entry(kept: _Kept) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A photograph of a finished map: its file, camera and pose."""
+    """A photograph of a finished map: its file, camera and pose; ``depth`` is the file of what the map knew of its
+    view when it was taken, None where nothing was kept."""
 
     file: Path
     camera: str
     stamp_ns: int
     model: CameraModel
     T_world_cam: F64
+    depth: Path | None = None
+
+    def known_depth(self, lens: F64, refuse: Callable[[str], None]) -> F32:
+        """The depth map of that time for a ``Sight`` with that ``lens``; empty where none can be read, which
+        ``refuse`` is told."""
+        try:
+            if self.depth is not None:
+                return decode_depth(self.depth.read_bytes(), lens)
+        except OSError as error:
+            refuse(f"cannot read {self.depth}: {error.strerror}")
+        except InputError as error:
+            refuse(f"{self.depth} {error}")
+        return np.empty((0, 0, 4), np.float32)
 
 
 def read_keyframes(map_folder: Path) -> list[Keyframe]:
@@ -187,13 +274,18 @@ def read_keyframes(map_folder: Path) -> list[Keyframe]:
 
 def photographs(map_folder: Path) -> Iterator[tuple[CameraImage, F64]]:
     """The photographs of a map, whole, in a frame of their own, and T_world_cam (4, 4); none where none were kept."""
+    for keyframe, image in _readable(map_folder):
+        yield image, keyframe.T_world_cam
+
+
+def _readable(map_folder: Path) -> Iterator[tuple[Keyframe, CameraImage]]:
     try:
         kept = read_keyframes(map_folder)
     except InputError:
         return
     for k in kept:
         if k.file.is_file():
-            yield CameraImage(k.camera, k.stamp_ns, k.file.read_bytes(), k.model, np.eye(4)), k.T_world_cam
+            yield k, CameraImage(k.camera, k.stamp_ns, k.file.read_bytes(), k.model, np.eye(4))
 
 
 def _keyframe(folder: Path, row: dict[str, Any]) -> Keyframe:
@@ -209,7 +301,8 @@ def _keyframe(folder: Path, row: dict[str, Any]) -> Keyframe:
     fx, fy, cx, cy = (float(row[key]) for key in ("fx", "fy", "cx", "cy"))
     model = CameraModel(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
     camera, stamp = str(row.get("camera", path.stem)), int(row.get("stamp_ns", 0))
-    return Keyframe(path, camera, stamp, model, inverse(T_cam_world))
+    depth = folder / str(row["depth"]) if row.get("depth") else None
+    return Keyframe(path, camera, stamp, model, inverse(T_cam_world), depth)
 
 
 def segment_all(
