@@ -1,13 +1,14 @@
 """IMU propagation, the path between two states and how errors move it: against analytic motions."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from artemis_edge.frames import ImuSamples
 from artemis_edge.odometry import se3
-from artemis_edge.odometry.propagation import HOLE_S, ImuNoise, propagate
+from artemis_edge.odometry.propagation import HOLE_S, ImuNoise, longest_hole_s, propagate, steadied
 from artemis_edge.odometry.state import State
 
 GRAVITY = np.array([0.0, 0.0, -9.80665])
@@ -133,6 +134,74 @@ def test_a_hole_is_bridged_with_the_velocity_and_says_so():
     off = np.abs(end.minus(whole)[:9])
     assert (off < 3 * np.sqrt(np.diag(end.P)[:9])).all()
     assert (np.diag(end.P)[:9] > 5 * np.diag(whole.P)[:9]).all()
+
+
+def test_in_a_hole_the_error_of_the_held_rate_is_estimated():
+    s, dt, alpha = state(0.4, 0.0), 0.1, NOISE.angular_acceleration
+    end, path = propagate(s, s.stamp_ns + 10**8, ImuSamples.empty(), NOISE, ORIGIN, np.zeros(3))
+    assert path.holes
+    # white angular acceleration of the density q: a rate that is wrong by q dt is a bias of the other sign
+    q = alpha**2 * 0.1
+    np.testing.assert_allclose(np.diag(end.P)[3:6], q * dt**3 / 3.0)
+    np.testing.assert_allclose(np.diag(end.P)[9:12], q * dt, rtol=1e-6)
+    np.testing.assert_allclose(np.diag(end.P[3:6, 9:12]), -0.5 * q * dt**2)
+    np.testing.assert_array_equal(end.P, end.P.T)
+
+
+@pytest.mark.parametrize("gap_s", [0.1, 0.25])
+def test_after_a_hole_the_gyroscope_has_its_own_bias_again(gap_s):
+    s = replace(state(0.4), gyro_bias=np.array([0.01, -0.02, 0.03]))
+    hole, _ = propagate(s, s.stamp_ns + round(gap_s * 1e9), imu(0.3, 0.4), NOISE, ORIGIN, np.ones(3))
+    assert hole.known is not None and hole.P[9, 9] > 100 * s.P[9, 9]
+    found = replace(hole, gyro_bias=hole.gyro_bias + 0.5)  # by a LiDAR: the rig turned slower than held
+    after, path = propagate(found, found.stamp_ns + 10**8, imu(0.55, 0.8), NOISE, ORIGIN, np.full(3, 0.5))
+    assert after.known is None and path.holes == (gap_s == 0.1)
+    np.testing.assert_array_equal(after.gyro_bias, s.gyro_bias)
+    np.testing.assert_allclose(after.P[9:12, 9:12], s.P[9:12, 9:12], atol=1e-9)
+    if gap_s == 0.1:  # in the 50 ms before the samples the rate goes from the held one to the first measured
+        first = motion(0.55)[2] - s.gyro_bias
+        np.testing.assert_allclose(path.turn_rate[0], 0.5 * (0.5 + first), atol=1e-9)
+
+
+@pytest.mark.parametrize("cuts", [1, 4])
+def test_what_is_unknown_in_a_hole_does_not_depend_on_how_it_is_cut(cuts):
+    s = state(0.4, 0.0)
+    for _ in range(cuts):
+        s, _ = propagate(s, s.stamp_ns + 10**8 // cuts, ImuSamples.empty(), NOISE, ORIGIN, np.zeros(3))
+    whole, _ = propagate(state(0.4, 0.0), s.stamp_ns, ImuSamples.empty(), NOISE, ORIGIN, np.zeros(3))
+    np.testing.assert_allclose(s.P, whole.P, atol=1e-12)
+
+
+def naive_longest_hole(stamps, first, last):
+    inside = [t for t in stamps if first < t < last]
+    before, after = [t for t in stamps if t <= first], [t for t in stamps if t >= last]
+    ends = [max(before) if before else first, *inside, min(after) if after else last]
+    return max([b - a for a, b in pairwise(ends)], default=0) * 1e-9
+
+
+@pytest.mark.parametrize("stamps", [[], [5], [0, 10, 30, 70], [12, 18, 40], [200], [0, 100], [20, 80]])
+def test_longest_hole(stamps):
+    none = np.zeros((len(stamps), 3))
+    samples = ImuSamples(np.array(stamps, np.int64), none, none)
+    for first, last in [(10, 60), (0, 100), (15, 16), (20, 20)]:
+        assert longest_hole_s(samples, first, last) == pytest.approx(naive_longest_hole(stamps, first, last))
+
+
+def test_a_carrier_that_hardly_accelerates_tells_where_down_is():
+    samples = imu(0.0, 1.2)
+    true, level = state(0.2), np.zeros(18)
+    level[3:6] = 0.4, -0.3, 0.2
+    s = replace(true.plus(level), P=np.diag([1e-4] * 3 + [0.3**2] * 3 + [0.5**2] * 3 + [1e-6] * 9))
+    for _ in range(8):
+        before, end = s, go(s, 0.1, samples)[0]
+        s = steadied(before, end, NOISE)
+    T = motion(1.0)[0]
+    down = s.T_world_body[:3, :3].T @ GRAVITY - T[:3, :3].T @ GRAVITY
+    assert np.linalg.norm(down) / 9.8 < 0.12  # 0.3 at first; the hand swings with 3 m/s2
+    sure = replace(state(0.2), P=1e-8 * np.eye(18))
+    np.testing.assert_allclose(
+        steadied(sure, go(sure, 0.1, samples)[0], NOISE).minus(go(sure, 0.1, samples)[0]), 0.0, atol=1e-6
+    )
 
 
 def test_without_samples_velocity_and_turn_are_held():

@@ -100,7 +100,7 @@ def test_match_and_linearise_equal_their_naive_twins(finest, n):
     points = room(n, 0.05, seed=9)
     matched = reg.match(plane_map, points, T, finest, 0.03**2)
     expected = naive_match(plane_map, points, T, finest, 0.03**2)
-    np.testing.assert_allclose(matched, expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(matched[:, :8], expected, rtol=1e-6, atol=1e-9)
     lin = reg.linearise(matched, T, 0.03**2)
     for fast, slow in zip(lin, naive_linearise(matched, T, 0.03**2), strict=True):
         np.testing.assert_allclose(fast, slow, rtol=1e-5, atol=1e-4)

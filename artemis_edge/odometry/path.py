@@ -39,8 +39,8 @@ class Path(NamedTuple):
 
     Piece k runs from ``time_s[k]`` (m,), begins at ``T_world_body[k]`` with ``velocity[k]`` (world) and has
     a constant ``turn_rate[k]`` (body axes, rad/s) and ``acceleration[k]`` (world, gravity included, m/s2). Its
-    nominal end is ``end``. ``origin`` (3,) is the LiDAR's place in the body; ``bridged``: no IMU sample told any
-    of it, velocity and turn rate are held.
+    nominal end is ``end``. ``origin`` (3,) is the LiDAR's place in the body; ``holes``: of some of it no
+    IMU sample told, velocity and turn rate are held there.
     """
 
     time_s: F64
@@ -50,7 +50,7 @@ class Path(NamedTuple):
     acceleration: F64
     end: State
     origin: F64
-    bridged: bool = False
+    holes: bool = False
 
     def at(self, state: State, time_s: float) -> PoseAt:
         """The LiDAR at a time by a state (at the stamp of the path's end), and how the state's error moves it."""

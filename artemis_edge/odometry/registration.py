@@ -39,10 +39,13 @@ _PASSES = 2  # the motion within the scan is corrected anew after the first
 _ITERATIONS = 12
 _CONVERGED_M = 1e-3  # mean displacement of the points by a step; a thirtieth of their noise
 _REMATCH = 0.05  # displacement, as a share of the voxel in use, after which planes are looked up again
-_GATE2 = 9.0  # three deviations
+GATE2 = 9.0  # three deviations
 _GRAZING2 = 0.05**2  # squared sine of incidence; a sheet seen edge-on is one laser line and its noise
-_KERNEL2 = 4.0  # Geman-McClure: a residual of two deviations has a quarter of the weight
-_MATCH_COLUMNS = 8  # point in the lidar frame (3), normal (3), n . c (1), variance of the plane there (1)
+KERNEL2 = 4.0  # Geman-McClure: a residual of two deviations has a quarter of the weight
+# point in the lidar frame (3), normal (3), n . c (1), variance of the plane there (1), which plane (1), the variance
+# of its place (1), of its points (1), and by how much its tilts vary more, rad2/m2 (1)
+MATCH_COLUMNS = 12
+PLANE, PLACE, THICK, TILT = 8, 9, 10, 11
 
 
 class Registration(NamedTuple):
@@ -88,7 +91,7 @@ def register(
     Starts on voxels twice as large as the misalignment and refines as the steps shrink.
     """
     T, arm = guess, arm_m(scan.points)
-    level, matched, moved = -1, np.empty((0, _MATCH_COLUMNS)), 0.0
+    level, matched, moved = -1, np.empty((0, MATCH_COLUMNS)), 0.0
     for _ in range(_PASSES):
         points = scan.at_one_time(prediction.twist(T))
         stale = True
@@ -115,14 +118,14 @@ def judge(
 
 
 def match(plane_map: PlaneMap, points: F32, T_world_lidar: F64, finest: int, noise2: float) -> F64:
-    """Planes that explain points: (m, 8) rows as the kernels take them; ``noise2`` = sigma^2 + tau^2, m2."""
+    """Planes that explain points: (m, 12) rows as the kernels take them; ``noise2`` = sigma^2 + tau^2, m2."""
     m: F64 = match_planes(
         plane_map.table, plane_map.voxel_m, finest, plane_map.levels, points, T_world_lidar, noise2
     )
     return m
 
 
-def arm_m(points: F32) -> float:
+def arm_m(points: F32 | F64) -> float:
     """Root mean square range of points, m: what a turn by one radian moves them by."""
     return float(np.sqrt(3.0 * np.mean(np.square(points, dtype=np.float64)))) if len(points) else 0.0
 
@@ -148,7 +151,7 @@ def match_planes(
 ) -> F64:
     """For each point the plane of the finest voxel that explains it; points without one are left out."""
     T, inverse, n = T_world_lidar, 1.0 / voxel_m, 0
-    out = np.empty((len(points), _MATCH_COLUMNS))
+    out = np.empty((len(points), MATCH_COLUMNS))
     for i in range(len(points)):
         px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
@@ -165,12 +168,13 @@ def match_planes(
             dx, dy, dz = x - w[CENTRE], y - w[CENTRE + 1], z - w[CENTRE + 2]
             r = w[NORMAL] * dx + w[NORMAL + 1] * dy + w[NORMAL + 2] * dz
             variance = w[THICKNESS] * (1.0 + (1.0 + _spread(w, dx, dy, dz)) / w[COUNT])
-            if r * r <= _GATE2 * (noise2 + variance):
+            if r * r <= GATE2 * (noise2 + variance):
                 o = out[n]
                 o[0], o[1], o[2] = px, py, pz
                 o[3], o[4], o[5] = w[NORMAL], w[NORMAL + 1], w[NORMAL + 2]
                 o[6] = o[3] * w[CENTRE] + o[4] * w[CENTRE + 1] + o[5] * w[CENTRE + 2]
-                o[7] = variance
+                o[7], o[PLANE], o[PLACE], o[THICK] = variance, slot, w[THICKNESS] / w[COUNT], w[THICKNESS]
+                o[TILT] = w[SPREAD] + w[SPREAD + 3] + w[SPREAD + 5]
                 n += 1
                 break
     return out[:n]
@@ -194,20 +198,20 @@ def _spread(row: F64, dx: float, dy: float, dz: float) -> float:
 
 @njit
 def linearise(matched: F64, T_world_lidar: F64, noise2: float) -> Linearised:
-    """Robust normal equations of matched planes (m, 8); matches beyond three deviations have no weight."""
+    """Robust normal equations of matched planes (m, 12); matches beyond three deviations have no weight."""
     T = T_world_lidar
     H, g, matches, total, score = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
     J = np.empty(6)
     for i in range(len(matched)):
-        px, py, pz, n0, n1, n2, nc, variance = matched[i]
+        px, py, pz, n0, n1, n2, nc, variance = matched[i, :8]
         for k in range(3):
             J[k] = n0 * T[0, k] + n1 * T[1, k] + n2 * T[2, k]
         J[3], J[4], J[5] = py * J[2] - pz * J[1], pz * J[0] - px * J[2], px * J[1] - py * J[0]
         r = J[0] * px + J[1] * py + J[2] * pz + n0 * T[0, 3] + n1 * T[1, 3] + n2 * T[2, 3] - nc
         s2 = noise2 + variance
-        if r * r > _GATE2 * s2:
+        if r * r > GATE2 * s2:
             continue
-        robust = (_KERNEL2 / (_KERNEL2 + r * r / s2)) ** 2
+        robust = (KERNEL2 / (KERNEL2 + r * r / s2)) ** 2
         weight = robust / s2
         matches += 1
         total += weight

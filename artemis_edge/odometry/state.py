@@ -6,7 +6,7 @@ state (n,) is, in this order,
     POSITION   0:3    of the body in world, m
     ROTATION   3:6    of the body, right perturbation R_world_body exp(.), rad
     VELOCITY   6:9    of the body in world, m/s
-    GYRO_BIAS  9:12   rad/s, in body axes
+    GYRO_BIAS  9:12   rad/s, in body axes; in a hole of the samples, of the turn rate that is held (``Known``)
     ACCEL_BIAS 12:15  m/s2, in body axes
     GRAVITY    15:18  acceleration of free fall in world, m/s2
     CAMERAS    18:    of every camera two: log of the inverse exposure, and the delay of its stamps, s
@@ -37,6 +37,17 @@ CAMERAS = 18
 _PER_CAMERA = 2
 
 
+class Known(NamedTuple):
+    """The gyroscope's ``bias`` (3,) and its covariance ``P`` (3, 3), put aside while no samples come.
+
+    Meanwhile the turn rate is held, like that of a gyroscope whose bias walks as fast as a carrier may turn: the
+    state's bias is then the error of that rate, and what a LiDAR sees of it is weighed like everything else.
+    """
+
+    bias: F64
+    P: F64
+
+
 @dataclass(frozen=True, slots=True)
 class State:
     """State at ``stamp_ns``.
@@ -44,7 +55,7 @@ class State:
     ``T_world_body`` (4, 4); ``velocity``, ``gravity`` (3,) in world; biases (3,) in body axes, to be subtracted
     from what is measured. Of every camera in ``cameras``: ``log_inverse_exposure`` (c,), relative to the first
     image, and ``image_delay_s`` (c,): an image was taken at its stamp minus this. ``P`` (n, n), n = 18 + 2 c, is the
-    covariance of the error.
+    covariance of the error. ``known``: None but in a hole of the samples.
     """
 
     stamp_ns: int
@@ -57,6 +68,7 @@ class State:
     cameras: tuple[str, ...] = ()
     log_inverse_exposure: F64 = field(default_factory=lambda: np.zeros(0))
     image_delay_s: F64 = field(default_factory=lambda: np.zeros(0))
+    known: Known | None = None
 
     def __len__(self) -> int:
         """Length of the error state."""
@@ -149,14 +161,19 @@ Linearise = Callable[[State], NormalEquations]
 
 
 def iterated_update(
-    prior: State, linearise: Linearise, iterations: int = 4, converged: float = 1e-4
+    prior: State,
+    linearise: Linearise,
+    iterations: int = 4,
+    converged: float = 1e-4,
+    start: State | None = None,
 ) -> State:
     """The most likely state after measurements, and its covariance: Gauss-Newton on prior and measurements.
 
     ``prior.P`` need not be invertible. Stops when the pose moves by less than ``converged`` (m and rad). A
-    second kind of measurement is a second update whose prior is the result of the first.
+    second kind of measurement is a second update whose prior is the result of the first. ``start``: where to begin, if
+    not at the prior.
     """
-    state = prior
+    state = prior if start is None else start
     step = np.zeros(len(prior))
     for _ in range(max(iterations, 1)):
         said = linearise(state)
