@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from artemis_edge.export.ply import read_mesh
-from artemis_edge.frames import LidarScan, SyncedFrame
+from artemis_edge.frames import CameraModel, LidarScan, SyncedFrame
 from artemis_edge.pipeline import Pipeline
+from artemis_edge.sight import DEPTH
 from tests import naive
 
 STAGES = ["odometry", "refinement", "voxel_map", "free_space", "mesher", "delta"]
@@ -59,6 +60,11 @@ def test_corridor_is_mapped_whole(tmp_path: Path) -> None:
     assert np.quantile(off, 0.95) < 0.02
     assert pipeline.lost == {}
     assert [stamp for stamp, _ in pipeline.trajectory] == [k * 100_000_000 for k in range(32)]
+    # a camera in the corridor that looks along it knows the wall, where a ray at 0.7 to the right meets it
+    T_world_cam = np.array([[0, 0, 1.0, 1.0], [-1, 0, 0, 0], [0, -1, 0, 0.1], [0, 0, 0, 1]])
+    view = pipeline.sight(CameraModel(160, 128, 90.0, 90.0, 79.5, 63.5), T_world_cam)
+    assert view.depth[64, 143, DEPTH] == pytest.approx(1.05 / 0.7, abs=0.12)
+    assert np.isfinite(view.depth[:, :, DEPTH]).mean() > 0.8
 
 
 def test_every_stage_tells_its_time_and_the_time_of_this_frame_only(tmp_path: Path) -> None:
