@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from artemis_edge import finishing
-from artemis_edge.frames import F32, I32
+from artemis_edge.frames import F32, F64, I32
 from tests import naive
 
 LONGEST_M = 0.45
@@ -110,7 +110,7 @@ class Twin:
         """Clockwise from b-a to b-c as seen from where the normal of b points to."""
         u, w, g = self.p[a] - self.p[b], self.p[c] - self.p[b], self.g[b]
         u, w = u - (u @ g) * g, w - (w @ g) * g
-        turn = math.atan2(-np.cross(u, w) @ g, u @ w)
+        turn = math.atan2(-triple(u, w, g), u @ w)
         return turn if turn > 0.0 else turn + 2.0 * math.pi
 
     def walk(self, seed: tuple[int, int]) -> list[tuple[int, int]]:
@@ -130,7 +130,7 @@ class Twin:
 
     def faces_out(self, f: Triangle) -> bool:
         p, q, r = self.p[list(f)]
-        return bool(np.cross(q - p, r - p) @ self.g[list(f)].sum(axis=0) > 0.0)
+        return triple(q - p, r - p, self.g[list(f)].sum(axis=0)) > 0.0
 
     def cut(self, loop: list[int]) -> list[Triangle]:
         """Ears by the shortest diagonal that is no edge yet; empty when there is none or one faces back."""
@@ -188,6 +188,13 @@ class Twin:
             if len(stay) == len(good):
                 return {turned(f) for f in all_faces}
             good = stay
+
+
+def triple(u: F64, v: F64, w: F64) -> float:
+    """u x v . w; for single vectors numpy's cross product takes twenty times as long."""
+    a, b, c = u.tolist()
+    d, e, f = v.tolist()
+    return float(np.dot((b * f - c * e, c * d - a * f, a * e - b * d), w))
 
 
 def edges_of(f: Triangle) -> list[tuple[int, int]]:
