@@ -646,6 +646,8 @@ def choose_batch(store: Store, stamp: int, schedule: Schedule, everything: bool,
     n = 0
     if not everything:
         n = _choose(store, stamp, schedule, False, True, batch, n)
+        if n == batch.shape[0]:
+            return n  # the rest of the queue has just been looked through and stays
     return _choose(store, stamp, schedule, everything, False, batch, n)
 
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from artemis_edge import mesher
 from artemis_edge.block_store import COUNT, HITS
 from artemis_edge.config import MesherConfig, VoxelMapConfig
 from artemis_edge.evaluate.topology import topology
@@ -296,3 +297,13 @@ def test_long_edges_are_surface_where_the_corners_were_hit_often(seed: int) -> N
     assert is_surface(0, 1, 2, rules, w) == (
         carried and (facing or (rules.agreement < -1.0 and area2 > 1e-12))
     )
+
+
+def test_a_triangle_is_owned_where_the_middle_of_its_cells_lies() -> None:
+    rng = np.random.default_rng(3)
+    cells = rng.integers(8, 20, (2000, 3, 3))
+    spread = ((cells[:, :, 0] << 20) | (cells[:, :, 1] << 10) | cells[:, :, 2]).astype(np.int64)
+    sums = cells.sum(axis=1)
+    expected = ((sums >= 35) & (sums <= 46)).all(axis=1)
+    found = [bool(mesher._is_owned(0, 1, 2, row)) for row in spread]
+    assert found == expected.tolist() and 100 < expected.sum() < 1900
