@@ -84,6 +84,7 @@ cluster-test: $(READY)
 train: $(READY)
 	@PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install -qq --only-binary :all: -e '.[dev,train]'
 	@$(BIN)/python training/views.py --out $(LEARNT)/learn --seeds 10000:10024 --views 20
+	@$(BIN)/python training/views.py --out $(LEARNT)/learn --seeds 10024:10034 --views 12 --width 960
 	@$(BIN)/python training/views.py --out $(LEARNT)/calibrate --seeds 20000:20001 --views 16
 	@$(BIN)/python training/views.py --out $(LEARNT)/judge --seeds 20001:20005 --views 18
 	@$(BIN)/python training/train.py --views $(LEARNT)/learn --check $(LEARNT)/calibrate --out $(LEARNT)/weights.pt

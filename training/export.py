@@ -23,7 +23,7 @@ import torch
 from labels import IGNORED, NETWORK_CLASSES
 from network import Network
 from onnx import TensorProto, helper, numpy_helper
-from samples import INPUT, Views, whole
+from samples import FINE_INPUT, INPUT, Views, whole
 from torch import Tensor
 from torch.nn import functional
 
@@ -138,6 +138,7 @@ def _write_manifest(path: Path, shares: Sequence[float]) -> None:
         "classes": list(NETWORK_CLASSES),
         "shares": list(shares),
         "input_size": [INPUT[1], INPUT[0]],
+        "fine_input_size": [FINE_INPUT[1], FINE_INPUT[0]],
         "stride": _STRIDE,
         "inputs": {"image": [1, 3, 0, 0]},
         "outputs": {"logits": [1, len(NETWORK_CLASSES), 0, 0]},

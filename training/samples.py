@@ -15,6 +15,7 @@ F32 = NDArray[np.float32]
 Rng = np.random.Generator
 
 INPUT = (640, 512)  # width, height that whole views are scaled to for the network
+FINE_INPUT = (960, 768)  # where nobody waits for a frame, besides
 CROP = (288, 224)
 _SCALE = (0.75, 1.2)  # of the views, whose crops these are
 _SOUGHT_SCALE = (0.75, 1.25)  # of crops that look for a class

@@ -1,6 +1,6 @@
 """Photographs of the virtual worlds with the class of every pixel: what the shipped network learns from.
 
-    python training/views.py --out VIEWS [--worlds NAME...] [--seeds A:B] [--views N]
+    python training/views.py --out VIEWS [--worlds NAME...] [--seeds A:B] [--views N] [--width PIXELS]
 
 One file ``WORLD-SEED.npz`` a world: ``photo`` uint8 (n, h, w, 3) RGB and ``label`` uint8 (n, h, w), indices of
 ``CLASS_NAMES``. They are photographs of the virtual rig's camera with all its faults. Two thirds of them are taken on
@@ -28,7 +28,7 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 Rng = np.random.Generator
 
-WIDTH = 640  # pixels; the network's input
+WIDTH = 640  # pixels; the network's input live
 WALK_S = 45.0
 #: How often views look for a class, relative to each other; the walk itself shows enough of the others.
 _SOUGHT = {
@@ -44,12 +44,12 @@ _TURN_DEG = np.array([12.0, 35.0, 8.0])  # about x (up and down), y (left and ri
 _TRIES = 20
 
 
-def render(world: str, seed: int, count: int) -> tuple[U8, U8]:
-    """``count`` photographs and their labels."""
+def render(world: str, seed: int, count: int, width: int = WIDTH) -> tuple[U8, U8]:
+    """``count`` photographs, ``width`` pixels across, and their labels."""
     rng = np.random.default_rng([seed, 81])
     # a photograph of 1280 pixels scaled down to this width has this share of its noise
-    noise = WIDTH / 1280 * rng.uniform(0.7, 1.6)
-    texts = {"imu": "off", "image_width": str(WIDTH), "image_noise": f"{noise:.3f}"}
+    noise = width / 1280 * rng.uniform(0.7, 1.6)
+    texts = {"imu": "off", "image_width": str(width), "image_noise": f"{noise:.3f}"}
     rig = build_rig(world, seed, WALK_S, "avia", read_settings(texts))
     camera = rig.new_camera()
     photos, labels = [], []
@@ -136,6 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--worlds", nargs="+", default=["street", "courtyard", "hall", "bench"])
     parser.add_argument("--seeds", default="10000:10050", help="FIRST:LAST+1")
     parser.add_argument("--views", type=int, default=20, help="photographs a world")
+    parser.add_argument("--width", type=int, default=WIDTH, help="pixels of a photograph")
     given = parser.parse_args(arguments)
     first, last = (int(n) for n in given.seeds.split(":"))
     given.out.mkdir(parents=True, exist_ok=True)
@@ -145,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if path.exists():
                 continue
             began = time.perf_counter()
-            photo, label = render(world, seed, given.views)
+            photo, label = render(world, seed, given.views, given.width)
             with path.with_suffix(".part").open("wb") as file:
                 np.savez(file, photo=photo, label=label)
             path.with_suffix(".part").rename(path)
