@@ -13,6 +13,7 @@ import numpy as np
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F32, F64
 from artemis_edge.sight import DEPTH, DOWN, INVERSE, NEAR_M, RIGHT, cell_px, empty_depth
+from artemis_edge.trajectory import FARTHEST_M
 
 # Relative to the depth: a fifteenth of sigma_geom, which weighs depths
 _STEP = 0.002
@@ -45,6 +46,8 @@ def decode_depth(content: bytes, lens: F64) -> F32:
     if picture is None or picture.dtype != np.uint16 or picture.shape != (count * high, wide):
         raise InputError(f"is not a depth map of {wide} x {high} cells")
     level, *told = np.split(picture.astype(np.float64), count)
+    if _depth_of(level.max()) > FARTHEST_M:
+        raise InputError("is damaged: it knows depths beyond any map")
     known = level > 0
     z = _depth_of(level)
     centre, right, down = ((plane - _ZERO) * _STEP / z for plane in told)
@@ -60,4 +63,4 @@ def decode_depth(content: bytes, lens: F64) -> F32:
 
 def _depth_of(level: F64) -> F64:
     """Depth [m] of the numbers in the first picture."""
-    return NEAR_M * np.exp((level - 1.0) * _STEP)
+    return np.asarray(NEAR_M * np.exp((level - 1.0) * _STEP))

@@ -18,7 +18,7 @@ from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F64, CameraImage, CameraModel, Trajectory
 from artemis_edge.json_file import read_json
 from artemis_edge.progress import say
-from artemis_edge.session.photos import photo_entry, suffix_of
+from artemis_edge.session.photos import camera_of, file_of, photo_entry
 from artemis_edge.trajectory import covered, interpolate, inverse
 
 FOLDER = "images"
@@ -41,7 +41,7 @@ class ImageSpool:
         try:
             entries = read_json(index)["photos"] if index.is_file() else []
             there = [self._take(folder / str(entry["file"]), entry) for entry in entries]
-        except (KeyError, TypeError, ValueError):
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
             raise InputError(f"{index} is damaged; make that map again") from None
         if not all(there):
             missing = len(there) - sum(there)
@@ -54,11 +54,11 @@ class ImageSpool:
         """Whether the image is there."""
         if not source.is_file():
             return False
-        camera, _, number = source.stem.rpartition("_")
+        camera, number = camera_of(source.name)
         image = _image(camera, entry)
         shutil.copyfile(source, self._folder / source.name)
-        self._offered[camera] = max(self._offered.get(camera, 0), int(number) + 1)
-        self._kept.append((int(number), source.name, image))
+        self._offered[camera] = max(self._offered.get(camera, 0), number + 1)
+        self._kept.append((number, source.name, image))
         self._placed[source.name] = inverse(np.array(entry["T_cam_world"], np.float64))
         return True
 
@@ -68,7 +68,7 @@ class ImageSpool:
         self._offered[image.name] = number + 1
         if self._most == 0 or number % self._stride:
             return
-        name = f"{image.name}_{number:06d}.{suffix_of(image.encoded)}"
+        name = file_of(image, number)
         (self._folder / name).write_bytes(image.encoded)
         self._kept.append((number, name, replace(image, encoded=b"")))
         self._thin()

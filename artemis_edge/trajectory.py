@@ -24,6 +24,8 @@ _LAST_S = 9_000_000_000
 _UNIT_TOLERANCE = 0.05
 # Fifteen times the Earth's radius: beyond any frame on it, and squares stay far from overflow.
 FARTHEST_M = 1e8
+# A rotation printed with a few digits is orthonormal up to this.
+_ROTATION_TOLERANCE = 1e-3
 # Printed stamps are rounded: this far beyond the first or last pose that pose still holds.
 COVER_NS = 1_000_000
 # Between poses this many frame periods apart nobody knows how the sensor moved.
@@ -60,6 +62,14 @@ def inverse(T: F64) -> F64:
     out[..., :3, 3] = -np.einsum("...ij,...j->...i", R, T[..., :3, 3])
     out[..., 3, 3] = 1.0
     return out
+
+
+def is_pose(T: F64) -> bool:
+    """Whether an array is a rotation and a translation of at most ``FARTHEST_M`` as a 4 x 4 matrix."""
+    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_M).all() or not np.allclose(T[3], [0, 0, 0, 1]):
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(R) > 0.0)
 
 
 def read_tum(path: Path) -> Trajectory:

@@ -5,6 +5,7 @@ import shutil
 import socket
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -36,7 +37,7 @@ from artemis_edge.odometry.known_map import KnownMap, Start
 from artemis_edge.odometry.lidar_odometry import LidarOdometry
 from artemis_edge.odometry.local_map import LocalMap
 from artemis_edge.paging import read_pages
-from artemis_edge.segmentation.keyframes import read_keyframes
+from artemis_edge.segmentation.keyframes import KeyframeStore, photographs, read_keyframes
 from artemis_edge.service.mapper import LiveMapper
 from artemis_edge.service.mapper_task import MapperTask
 from artemis_edge.session import feed
@@ -308,7 +309,8 @@ def test_an_odometry_that_has_not_begun_is_where_it_is_placed() -> None:
     assert np.allclose(odometry.track(SyncedFrame(0, 0, ())).T_world_lidar, T)
 
 
-def test_points_and_photographs_of_the_earlier_map_stay(tmp_path: Path) -> None:
+@pytest.mark.parametrize("camera", ["cam", "robot/cam", "../cam", "/cam"])
+def test_points_and_photographs_of_the_earlier_map_stay(camera: str, tmp_path: Path) -> None:
     png = cv2.imencode(".png", np.full((4, 6, 3), 128, np.uint8))[1].tobytes()
     model, poses = (
         CameraModel(6, 4, 5.0, 5.0, 3.0, 2.0),
@@ -324,7 +326,7 @@ def test_points_and_photographs_of_the_earlier_map_stay(tmp_path: Path) -> None:
         T = _turned(0.0, (5.0 * run, 0.0, 0.0))
         scan, image = (
             LidarScan(np.full((3, 3), run, np.float32), 0),
-            CameraImage("cam", 5, png, model, np.eye(4)),
+            CameraImage(camera, 5, png, model, np.eye(4)),
         )
         frame = SyncedFrame(run, 0, (scan,), (image,))
         moved = (DeskewedScan(scan.points, np.zeros(3)),)
@@ -336,10 +338,54 @@ def test_points_and_photographs_of_the_earlier_map_stay(tmp_path: Path) -> None:
     rows = np.concatenate(list(kept.chunks()))
     assert rows["position"][:, 0].tolist() == [0, 0, 0, 1, 1, 1] and (rows["tick"] == 0).all()
     index = json.loads((folders[1] / "images.json").read_text())["photos"]
-    assert [entry["file"] for entry in index] == ["images/cam_000000.png", "images/cam_000001.png"]
+    stem = quote(camera, safe="")  # a frame's name may hold what a file's may not
+    assert [entry["file"] for entry in index] == [f"images/{stem}_000000.png", f"images/{stem}_000001.png"]
     assert all((folders[1] / entry["file"]).read_bytes() == png for entry in index)
     keyframes = read_keyframes(folders[1])
     assert sorted(float(k.T_world_cam[0, 3]) for k in keyframes) == [0.0, 5.0]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"fx": float("nan")},
+        {"stamp_ns": float("inf")},
+        {"file": "../cam.png"},
+        {"depth": "/dev/zero"},
+        {"depth": "a\0b"},
+        {"depth": 5},
+        {"T_cam_world": np.zeros((4, 4)).tolist()},
+        {"distortion": [float("inf")] * 5},
+    ],
+)
+def test_damaged_indices_of_photographs_are_refused(damage: dict[str, object], tmp_path: Path) -> None:
+    entry = {"file": "cam.png", "camera": "cam", "stamp_ns": 5, "width": 6, "height": 4, "fx": 5.0, "fy": 5.0}
+    entry |= {"cx": 3.0, "cy": 2.0, "distortion": [0.0] * 5, "T_cam_world": np.eye(4).tolist()}
+    index = tmp_path / "keyframes" / "index.json"
+    index.parent.mkdir()
+    store = KeyframeStore.by(SegmentationConfig(), tmp_path / "store")
+    index.write_text(json.dumps({"photos": [entry]}))
+    assert len(read_keyframes(tmp_path)) == 1
+    index.write_text(json.dumps({"photos": [entry | damage]}))
+    with pytest.raises(InputError, match="map the recording again"):
+        store.take_over(tmp_path)
+    with pytest.raises(InputError, match="map the recording again"):
+        list(photographs(tmp_path))
+
+
+def test_photographs_for_questions_that_are_gone_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = CameraImage("cam", 5, b"\x89PNG", CameraModel(6, 4, 5.0, 5.0, 3.0, 2.0), np.eye(4))
+    for run in range(2):
+        store = KeyframeStore.by(SegmentationConfig(), tmp_path / f"store_{run}")
+        if run:
+            next((tmp_path / "keyframes").glob("*.png")).unlink()
+            store.take_over(tmp_path)
+        store.offer(image, np.eye(4))
+        assert len(store) == 1
+        store.save(tmp_path)
+    assert "1 photographs kept for questions cannot be read" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("known", [True, False])

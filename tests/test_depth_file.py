@@ -76,6 +76,9 @@ def test_what_is_no_depth_of_this_camera_is_refused() -> None:
     ):  # fmt: skip
         with pytest.raises(InputError, match="is not a depth map of"):
             decode_depth(content, lens)
+    beyond = np.full((4 * view.depth.shape[0], view.depth.shape[1]), 65535, np.uint16)
+    with pytest.raises(InputError, match="depths beyond any map"):
+        decode_depth(bytes(cv2.imencode(".png", beyond)[1]), view.lens)
 
 
 def test_where_nothing_was_known_what_is_known_now_stands() -> None:

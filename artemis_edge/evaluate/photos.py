@@ -14,10 +14,8 @@ from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, U8, CameraModel
 from artemis_edge.json_file import read_json
 from artemis_edge.lens import CAMERA_RULE, is_camera
-from artemis_edge.trajectory import FARTHEST_M, inverse
+from artemis_edge.trajectory import inverse, is_pose
 
-# A rotation printed with a few digits is orthonormal up to this.
-_ROTATION_TOLERANCE = 1e-3
 # A lens that leaves e^-10 of the light in its corners leaves none; far beyond it numbers overflow.
 _STEEPEST_FALLOFF = 10.0
 
@@ -80,7 +78,7 @@ def _photo(folder: Path, entry: Any, where: str) -> Photo:
         k1, k2, p1, p2, k3 = (float(k) for k in entry["distortion"])
         T_cam_world = np.array(entry["T_cam_world"], np.float64)
         falloff = tuple(float(a) for a in entry.get("falloff", ()))
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
         raise InputError(
             f"{where} is not complete; it needs file, fx, fy, cx, cy, distortion and T_cam_world"
         ) from None
@@ -88,19 +86,12 @@ def _photo(folder: Path, entry: Any, where: str) -> Photo:
         raise InputError(f"{where}: the distortion must be finite, and {CAMERA_RULE}")
     if not all(abs(a) <= _STEEPEST_FALLOFF for a in falloff):
         raise InputError(f"{where}: its falloff is no lens's; coefficients are at most {_STEEPEST_FALLOFF:g}")
-    if not _is_pose(T_cam_world):
+    if not is_pose(T_cam_world):
         raise InputError(f"{where}: T_cam_world is not a rotation and a translation as a 4 x 4 matrix")
     image = read_image(folder / file)
     height, width = image.shape[:2]
     camera = CameraModel(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
     return Photo(file, image, camera, inverse(T_cam_world), falloff)
-
-
-def _is_pose(T: F64) -> bool:
-    if T.shape != (4, 4) or not (np.abs(T) <= FARTHEST_M).all() or not np.allclose(T[3], [0, 0, 0, 1]):
-        return False
-    R = T[:3, :3]
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(R) > 0.0)
 
 
 def read_image(path: Path) -> U8:

@@ -22,11 +22,13 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F32, F64, U8, CameraImage, CameraModel
 from artemis_edge.json_file import read_json
-from artemis_edge.progress import Report, silent
+from artemis_edge.lens import CAMERA_RULE, is_camera
+from artemis_edge.progress import Report, say, silent
 from artemis_edge.segmentation.backend import Backend, Prompt, Segmentation
 from artemis_edge.segmentation.trial import decode
+from artemis_edge.session.photos import file_of
 from artemis_edge.sight import Sight
-from artemis_edge.trajectory import inverse
+from artemis_edge.trajectory import inverse, is_pose
 
 FOLDER = "keyframes"
 INDEX = "index.json"
@@ -114,19 +116,26 @@ class KeyframeStore:
         return False
 
     def take_over(self, map_folder: Path) -> None:
-        """Begin with the photographs of a map made before, and their depth."""
-        for keyframe, image in _readable(map_folder):
+        """Begin with the photographs of a map made before, and their depth; says how many cannot be read.
+
+        Raises InputError where their index is damaged.
+        """
+        missing: list[str] = []
+        for keyframe, image in _readable(map_folder, missing.append):
             self.offered += 1
             if is_new(self._views(image.name), keyframe.T_world_cam, self.apart):
                 self._keep(image, keyframe.T_world_cam, _content(keyframe.depth), None)
+        if missing:
+            say(
+                f"{len(missing)} photographs kept for questions cannot be read, the first: {missing[0]}; "
+                "it goes on without them"
+            )
 
     def _keep(self, image: CameraImage, T_world_cam: F64, depth: bytes, looked_ns: int | None) -> bool:
-        suffix = "png" if image.encoded.startswith(b"\x89PNG") else "jpg"
         bare = CameraImage(image.name, image.stamp_ns, b"", image.model, image.T_cam_lidar, image.exposure_s)
-        stem, size = f"{image.name}_{self.offered:06d}", len(image.encoded) + len(depth)
-        kept = _Kept(
-            bare, T_world_cam, f"{stem}.{suffix}", f"{stem}{_DEPTH}" if depth else "", size, looked_ns
-        )
+        file, size = file_of(image, self.offered), len(image.encoded) + len(depth)
+        depth_file = f"{Path(file).stem}{_DEPTH}" if depth else ""
+        kept = _Kept(bare, T_world_cam, file, depth_file, size, looked_ns)
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / kept.file).write_bytes(image.encoded)  # scratch: no need to wait for the disk
         if depth:
@@ -259,12 +268,12 @@ def read_keyframes(map_folder: Path) -> list[Keyframe]:
 
     Raises InputError where none were kept or the index cannot be read.
     """
-    for index in (map_folder / FOLDER / INDEX, map_folder / _OTHER_INDEX):
+    for index in _indices(map_folder):
         if index.is_file():
             try:
                 rows = read_json(index)["photos"]
                 found = [_keyframe(index.parent, row) for row in rows]
-            except (ValueError, KeyError, TypeError, OSError) as error:
+            except (AttributeError, ValueError, KeyError, OverflowError, TypeError, OSError) as error:
                 raise InputError(f"{index} cannot be read ({error}); map the recording again") from None
             return sorted(found, key=lambda item: (item.stamp_ns, item.camera))
     raise InputError(
@@ -273,36 +282,57 @@ def read_keyframes(map_folder: Path) -> list[Keyframe]:
 
 
 def photographs(map_folder: Path) -> Iterator[tuple[CameraImage, F64]]:
-    """The photographs of a map, whole, in a frame of their own, and T_world_cam (4, 4); none where none were kept."""
+    """The photographs of a map, whole, in a frame of their own, and T_world_cam (4, 4); none where none were kept.
+
+    Raises InputError where their index is damaged.
+    """
     for keyframe, image in _readable(map_folder):
         yield image, keyframe.T_world_cam
 
 
-def _readable(map_folder: Path) -> Iterator[tuple[Keyframe, CameraImage]]:
-    try:
-        kept = read_keyframes(map_folder)
-    except InputError:
+def _readable(
+    map_folder: Path, missing: Callable[[str], None] = lambda sentence: None
+) -> Iterator[tuple[Keyframe, CameraImage]]:
+    if not any(index.is_file() for index in _indices(map_folder)):
         return
-    for k in kept:
-        if k.file.is_file():
-            yield k, CameraImage(k.camera, k.stamp_ns, k.file.read_bytes(), k.model, np.eye(4))
+    for k in read_keyframes(map_folder):
+        try:
+            encoded = k.file.read_bytes()
+        except OSError as error:
+            missing(f"{k.file} ({error.strerror})")
+            continue
+        yield k, CameraImage(k.camera, k.stamp_ns, encoded, k.model, np.eye(4))
+
+
+def _indices(map_folder: Path) -> tuple[Path, Path]:
+    return map_folder / FOLDER / INDEX, map_folder / _OTHER_INDEX
 
 
 def _keyframe(folder: Path, row: dict[str, Any]) -> Keyframe:
-    path = folder / str(row["file"])
+    path = _inside(folder, row["file"])
     T_cam_world = np.array(row["T_cam_world"], np.float64)
     k1, k2, p1, p2, k3 = (float(value) for value in row["distortion"])
-    if T_cam_world.shape != (4, 4):
-        raise ValueError("a pose is no 4 x 4 matrix")
+    if not is_pose(T_cam_world):
+        raise ValueError("a pose is not a rotation and a translation as a 4 x 4 matrix")
     width, height = int(row.get("width", 0)), int(row.get("height", 0))
     if not width or not height:
         pixels = decode(path.read_bytes())
         height, width = (0, 0) if pixels is None else pixels.shape[:2]
     fx, fy, cx, cy = (float(row[key]) for key in ("fx", "fy", "cx", "cy"))
+    if not is_camera(fx, fy, cx, cy) or not np.isfinite([k1, k2, p1, p2, k3]).all():
+        raise ValueError(f"the distortion must be finite, and {CAMERA_RULE}")
     model = CameraModel(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
     camera, stamp = str(row.get("camera", path.stem)), int(row.get("stamp_ns", 0))
-    depth = folder / str(row["depth"]) if row.get("depth") else None
+    depth = _inside(folder, row["depth"]) if row.get("depth") else None
     return Keyframe(path, camera, stamp, model, inverse(T_cam_world), depth)
+
+
+def _inside(folder: Path, name: object) -> Path:
+    """A file of a map's folder; ValueError where the name is none or leads out of it."""
+    relative = Path(name) if isinstance(name, str) and name.isprintable() else None
+    if relative is None or relative.is_absolute() or ".." in relative.parts:
+        raise ValueError(f"{name!a:.80} is not a file in it")
+    return folder / relative
 
 
 def segment_all(

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 import numpy as np
 
@@ -81,7 +82,7 @@ class HeldOut:
         self._seen[image.name] = number
         if number % self.every:
             return False
-        file = f"{FOLDER}/{image.name}_{number:06d}.{suffix_of(image.encoded)}"
+        file = f"{FOLDER}/{file_of(image, number)}"
         (self.out / FOLDER).mkdir(exist_ok=True)
         write_bytes(self.out / file, image.encoded)
         bare = replace(image, encoded=b"")
@@ -129,6 +130,17 @@ class HeldOut:
 
 def _falloff(coefficients: F64 | None) -> dict[str, Any]:
     return {} if coefficients is None else {"falloff": [round(float(a), 6) for a in coefficients]}
+
+
+def file_of(image: CameraImage, number: int) -> str:
+    """Name for the file of a camera's encoded image; a camera's name may hold what names of files may not."""
+    return f"{quote(image.name, safe='', errors='replace')}_{number:06d}.{suffix_of(image.encoded)}"
+
+
+def camera_of(file: str) -> tuple[str, int]:
+    """Camera and number of a file that :func:`file_of` named; ValueError where it named none."""
+    camera, _, number = Path(file).stem.rpartition("_")
+    return unquote(camera), int(number)
 
 
 def suffix_of(encoded: bytes) -> str:
