@@ -152,10 +152,18 @@ def test_a_fine_size(registry: Registry, tmp_path: Path) -> None:
         )
     one_size = networks.semantic(tmp_path / "o.onnx", (64, 96))
     assert "of one size only" in refused(registry, one_size, classes=names, fine_input_size=(128, 192))
+    one_side = networks.semantic(tmp_path / "h.onnx", (64, None))  # runs at 64 rows, not at 128
+    assert "does not run on this input" in refused(
+        registry, one_side, classes=names, fine_input_size=(128, 192), **size
+    )
     assert add(registry, path, classes=names, fine_input_size=(96, 144), **size).fine_input_size == (96, 144)
     assert registry.find().open(fine=True).segment(np.zeros((96, 144, 3), np.uint8), []).dense.score.shape == (
         24, 36, 1,
     )  # fmt: skip
+    manifest = registry.store / "s" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace("144", "32"))
+    with pytest.raises(InputError, match="fine_input_size is smaller than input_size"):
+        registry.find("s").open()
 
 
 def test_flipped_bytes_are_one_sentence_or_work(

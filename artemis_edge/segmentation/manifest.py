@@ -59,6 +59,11 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     source: str = ""
     note: str = ""
 
+    def __post_init__(self) -> None:
+        fine = self.fine_input_size
+        if fine is not None and (fine[0] < self.input_size[0] or fine[1] < self.input_size[1]):
+            raise ValueError("fine_input_size is smaller than input_size")
+
 
 def read_manifest(path: Path) -> Manifest:
     """Read a manifest; raises InputError where it is none."""

@@ -26,7 +26,7 @@ from artemis_edge.segmentation.semantic import Semantic
 from artemis_edge.segmentation.words import canonical
 from artemis_edge.segmentation.yolo_seg import Thresholds, YoloSeg
 
-_SMOKE_SIZE = (120, 160, 3)
+_SMOKE_SIZE = (120, 160)
 _SMOKE_WORDS = ("person", "car", "tree")
 
 #: Further files that a kind may have; which of them it needs is checked when it is opened.
@@ -161,8 +161,8 @@ class Smoke:
     words: tuple[str, ...]
 
 
-def smoke_test(backend: Backend) -> Smoke:
-    """Two images of noise through a backend; raises InputError where it fails."""
+def smoke_test(backend: Backend, size: tuple[int, int] = _SMOKE_SIZE) -> Smoke:
+    """Two images of noise, of that size (height, width), through a backend; raises InputError where it fails."""
     words = [canonical(name) for name in backend.classes] or list(_SMOKE_WORDS)
     asked = [word for word in dict.fromkeys(words) if backend.support(word).status is Status.MATCHED][
         :MOST_SLOTS
@@ -171,10 +171,10 @@ def smoke_test(backend: Backend) -> Smoke:
     ms = 0.0
     for seed in range(2):
         start = time.process_time()
-        backend.segment(_noise(seed), prompts)
+        backend.segment(_noise(seed, size), prompts)
         ms = (time.process_time() - start) * 1e3
     return Smoke(ms, tuple(asked))
 
 
-def _noise(seed: int) -> U8:
-    return np.random.default_rng(seed).integers(0, 256, _SMOKE_SIZE, np.uint8)
+def _noise(seed: int, size: tuple[int, int]) -> U8:
+    return np.random.default_rng(seed).integers(0, 256, (*size, 3), np.uint8)

@@ -134,6 +134,8 @@ class Registry:
                 into = manifest.file if role == "model" else manifest.parts[role].file
                 shutil.copyfile(path, folder / into)
             smoke = smoke_test(open_model(manifest, folder))
+            if manifest.fine_input_size is not None:  # it must go through at that size, too
+                smoke_test(open_model(manifest, folder, fine=True), manifest.fine_input_size)
             write_manifest(folder / _MANIFEST, manifest)
         return manifest, smoke
 
