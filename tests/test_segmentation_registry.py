@@ -2,6 +2,9 @@
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -332,3 +335,12 @@ def test_class_files(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(InputError):
             read_classes(path)
+
+
+def test_a_network_leaves_nothing_in_the_home_folder(tmp_path: Path) -> None:
+    path, home = networks.semantic(tmp_path / "s.onnx"), tmp_path / "home"
+    home.mkdir()
+    code = "import sys, pathlib, artemis_edge.segmentation.network as n; n.Network(pathlib.Path(sys.argv[1]))"
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("XDG_", "ORT_"))}
+    subprocess.run([sys.executable, "-c", code, str(path)], env=kept | {"HOME": str(home)}, check=True)
+    assert list(home.rglob("*")) == []
