@@ -19,6 +19,7 @@ from artemis_edge.odometry.image_update import SeenScan
 from artemis_edge.odometry.path import Path, PoseAt
 from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import match
+from artemis_edge.odometry.silhouette import nearest_depth, partly_covered
 from artemis_edge.odometry.state import NormalEquations, State, iterated_update
 from artemis_edge.odometry.visual_patch import (
     SIDE,
@@ -43,10 +44,13 @@ _SIGMA = 20.0  # grey levels: noise, and what a plane, a gain and blur do not ex
 _DELAY_SIGMA_S = 0.02  # what is expected of unsynchronised cameras
 _EXPOSURE_SIGMA = 0.1  # of the logarithm, after the median brightness is followed
 _LEAST_PATCHES = 15
+_OPEN_RAD = 0.005  # deviation of the attitude, some two pixels, beyond which no patches are taken
 _UNSEEN = 10  # images after which a patch that is not seen is forgotten
-_FITS, _FAILURES = 0.15, 3  # a patch that fits less so often in a row is hidden or moved
+_FITS, _FAILURES = 0.4, 3  # a patch that fits less so often in a row is hidden or moved
 _ITERATIONS = 4  # one on each coarse level, the rest on the finest
 _LEAST_SCORE = 0.3  # mean fit of all patches below which an image is not believed
+# An image that fits much worse than those before is where the patches pull to a wrong place; of a scan it is 85 %, too
+_OF_USUAL, _NEW = 0.85, 0.1
 _NOISE_M = 0.03
 
 
@@ -120,6 +124,7 @@ class VisualUpdate:
     lost: dict[str, int] = field(default_factory=dict)
     _kept: dict[str, _Kept] = field(default_factory=dict)
     _last: tuple[str, int, Picture | None] | None = None
+    _scores: dict[str, float] = field(default_factory=dict)
 
     def update(self, state: State, path: Path, image: CameraImage, scan: SeenScan, planes: PlaneMap) -> State:
         """The state after an image, or itself where the image says nothing."""
@@ -135,10 +140,17 @@ class VisualUpdate:
             return state
         found = iterated_update(prior, measured, _ITERATIONS, 0.0)
         last = measured.compare(found, 0)
-        if last.seen < _LEAST_PATCHES or last.score < max(_LEAST_SCORE, measured.compare(prior, 0).score):
+        least = max(_LEAST_SCORE, measured.compare(prior, 0).score, _OF_USUAL * self._usual(image.name, last.score))
+        if last.seen < _LEAST_PATCHES or last.score < least:
             self._count("images not believed")
             return prior
         return found
+
+    def _usual(self, camera: str, score: float) -> float:
+        """The running mean of a camera's scores before this one, which joins it."""
+        usual = self._scores.get(camera, score)
+        self._scores[camera] = usual + _NEW * (score - usual)
+        return usual
 
     def remember(
         self, state: State, path: Path, image: CameraImage, scan: SeenScan, planes: PlaneMap
@@ -153,6 +165,9 @@ class VisualUpdate:
         kept.unseen = np.where(share < 0.0, kept.unseen + 1, 0)
         kept.failed = np.where(share < 0.0, kept.failed, np.where(share < _FITS, kept.failed + 1, 0))
         kept = kept.only((kept.unseen < _UNSEEN) & (kept.failed < _FAILURES))
+        self._kept[image.name] = kept
+        if np.sqrt(np.diag(state.P)[3:6].max()) > _OPEN_RAD:
+            return  # patches taken now would hold the error of the attitude for true
         T_world_lidar = path.at(state, 0.0).T_world_lidar
         T_cam_world = measured.T_cam_world(measured.pose(state))
         new = self._new(seen, T_cam_world, T_world_lidar, scan.points, planes, kept.patches)
@@ -173,6 +188,7 @@ class VisualUpdate:
         """The most telling patch of each free cell of an image."""
         free = _free(seen, T_cam_world, known.anchor[:, :3])
         T_cam_lidar = T_cam_world @ T_world_lidar
+        ahead = points @ T_cam_lidar[:3, :3].T + T_cam_lidar[:3, 3]
         points = points[
             free[_cells(seen, T_cam_lidar, points.astype(np.float64))]
         ]  # most cells have their patch already
@@ -180,7 +196,9 @@ class VisualUpdate:
         centres = matched[:, :3] @ T_world_lidar[:3, :3].T + T_world_lidar[:3, 3]
         normals = matched[:, 3:6]
         centres -= (np.einsum("ij,ij->i", normals, centres) - matched[:, 6])[:, None] * normals
-        cell = _cells(seen, T_cam_world, centres)
+        cell = np.where(
+            _whole(seen, T_cam_world, ahead, centres, normals), _cells(seen, T_cam_world, centres), -1
+        )
         chosen = _strongest(seen, T_cam_world, centres, np.where(free[cell], cell, -1))
         T_world_cam = se3.inverse(T_cam_world)
         anchors, inside = anchors_on(seen.eyes[0], T_world_cam, centres[chosen], normals[chosen])
@@ -295,6 +313,15 @@ def _free(seen: Picture, T_cam_world: F64, anchors: F64) -> Bool:
     free[_cells(seen, T_cam_world, anchors)] = False
     free[-1] = False
     return free
+
+
+def _whole(seen: Picture, T_cam_world: F64, points: F64, centres: F64, normals: F64) -> Bool:
+    """Which patches on planes (n, 3) of the world no nearer point (m, 3) of the camera's frame covers a part of."""
+    height, width = seen.pyramid[0].shape
+    K, R = seen.eyes[0].K, T_cam_world[:3, :3]
+    nearest = nearest_depth(points, K, width, height)
+    whole: Bool = ~partly_covered(centres @ R.T + T_cam_world[:3, 3], normals @ R.T, nearest, K)
+    return whole
 
 
 def _cells(seen: Picture, T_cam_world: F64, points: F64) -> I64:
