@@ -140,7 +140,9 @@ class VisualUpdate:
             return state
         found = iterated_update(prior, measured, _ITERATIONS, 0.0)
         last = measured.compare(found, 0)
-        least = max(_LEAST_SCORE, measured.compare(prior, 0).score, _OF_USUAL * self._usual(image.name, last.score))
+        least = max(
+            _LEAST_SCORE, measured.compare(prior, 0).score, _OF_USUAL * self._usual(image.name, last.score)
+        )
         if last.seen < _LEAST_PATCHES or last.score < least:
             self._count("images not believed")
             return prior
