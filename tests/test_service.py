@@ -58,7 +58,7 @@ def played(
     tmp = tmp_path_factory.mktemp("run")
     red_and_green = np.zeros((48, 64, 3), np.uint8)  # BGR
     red_and_green[:, :28, 2] = red_and_green[:, 36:, 1] = 255
-    walk = read(small_session.write(tmp / "walk", frames=25, points=3000, photograph=red_and_green))
+    walk = read(small_session.write(tmp / "walk", frames=25, points=9000, photograph=red_and_green))
     session, seen = tmp / "recorded", dict[str, Any]()
     warm_up(
         Config(), tmp / "warm-up", questions=True
