@@ -117,6 +117,26 @@ def test_sample_is_bilinear_interpolation_on_a_grid() -> None:
     assert not sample(grey, np.array([[2.0, 1, 0], [20, 0, 1]]), SIDE, out)
 
 
+def _sure(state: State) -> State:
+    """The same with its pose known."""
+    P = state.P.copy()
+    P[:6] *= 1e-3
+    P[:, :6] *= 1e-3
+    return replace(state, P=P)
+
+
+def test_no_patches_are_taken_while_the_attitude_is_unsure() -> None:
+    visual, path = VisualUpdate(), SteadyPath(np.zeros(6))
+    scan, planes = _wall(np.eye(4))
+    image = _photograph(np.eye(4))
+    state = visual.update(_state(np.eye(4)), path, image, scan, planes)
+    assert np.sqrt(state.P[3, 3]) > 0.005
+    for known, later in ((state, True), (_sure(state), False)):
+        visual.remember(known, path, image, scan, planes)
+        found = visual.update(state, path, replace(image, stamp_ns=1), scan, planes)
+        assert (found is state) == later
+
+
 @pytest.mark.parametrize("gain", [1.0, 0.4])
 def test_a_wall_gives_back_place_attitude_exposure_and_delay(gain: float) -> None:
     visual, path = VisualUpdate(), SteadyPath(np.zeros(6))
@@ -124,7 +144,7 @@ def test_a_wall_gives_back_place_attitude_exposure_and_delay(gain: float) -> Non
     scan, planes = _wall(first)
     state = visual.update(_state(first), path, _photograph(first), scan, planes)
     assert state.cameras == ("cam",)
-    visual.remember(state, path, _photograph(first), scan, planes)
+    visual.remember(_sure(state), path, _photograph(first), scan, planes)
     wrong = second @ se3.exp(np.array([0.004, 0.02, -0.01, 0.003, -0.002, 0.002]))
     prior = replace(state, T_world_body=wrong)
     found = visual.update(prior, path, _photograph(second, gain, stamp_ns=1), scan, planes)
@@ -139,7 +159,7 @@ def test_a_wrong_time_of_images_is_found_where_the_camera_moves() -> None:
     visual, path = VisualUpdate(), SteadyPath(_TWIST)
     still, scan_and_planes = np.eye(4), _wall(np.eye(4))
     state = visual.update(_state(still), path, _photograph(still), *scan_and_planes)
-    visual.remember(state, path, _photograph(still), *scan_and_planes)
+    visual.remember(_sure(state), path, _photograph(still), *scan_and_planes)
     P = state.P.copy()
     P[:6, :6] *= 1e-6
     late = _photograph(se3.exp(-0.01 * _TWIST), stamp_ns=0)  # says 0, was taken 10 ms before
@@ -153,15 +173,15 @@ def test_no_patches_no_image_and_two_cameras() -> None:
     state = visual.update(_state(np.eye(4)), path, _photograph(np.eye(4)), scan, planes)
     broken = replace(_photograph(np.eye(4)), encoded=b"nothing", stamp_ns=5)
     assert visual.update(state, path, broken, scan, planes) is state
-    visual.remember(state, path, broken, scan, planes)
+    visual.remember(_sure(state), path, broken, scan, planes)
     assert visual.lost == {"images not decodable": 1} and picture(broken) is None
     assert picture(replace(broken, encoded=b"")) is None  # held out: only its pose is asked for
     none = SeenScan(np.empty((0, 3), np.float32))
-    visual.remember(state, path, _photograph(np.eye(4)), none, planes)
+    visual.remember(_sure(state), path, _photograph(np.eye(4)), none, planes)
     state = visual.update(state, path, _photograph(np.eye(4), name="other"), none, planes)
     assert state.cameras == ("cam", "other") and len(state) == CAMERAS + 4
     away = se3.exp(np.array([0.0, 0, 0, 0, 0, 3.0]))
-    visual.remember(state, path, _photograph(np.eye(4)), scan, planes)
+    visual.remember(_sure(state), path, _photograph(np.eye(4)), scan, planes)
     turned = replace(state, T_world_body=away)
     assert visual.update(turned, path, _photograph(np.eye(4), stamp_ns=9), scan, planes) is turned
     assert visual.lost["images without patches"] == 1
@@ -172,7 +192,7 @@ def test_an_image_of_something_else_is_not_believed() -> None:
     scan, planes = _wall(np.eye(4))
     image = _photograph(np.eye(4))
     state = visual.update(_state(np.eye(4)), path, image, scan, planes)
-    visual.remember(state, path, image, scan, planes)
+    visual.remember(_sure(state), path, image, scan, planes)
     noise = np.random.default_rng(3).integers(0, 255, (_MODEL.height, _MODEL.width)).astype(np.uint8)
     other = replace(image, stamp_ns=3, encoded=cv2.imencode(".png", noise)[1].tobytes())
     found = visual.update(state, path, other, scan, planes)
