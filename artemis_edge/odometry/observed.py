@@ -17,11 +17,15 @@ from artemis_edge.frames import F64, Bool
 from artemis_edge.odometry.registration import (
     DEGENERATE,
     GATE2,
-    KERNEL2,
     PLACE,
     PLANE,
     THICK,
     TILT,
+    VARIANCE,
+    accumulate,
+    geman_mcclure,
+    mirror,
+    residual,
 )
 from artemis_edge.odometry.state import NormalEquations
 
@@ -107,40 +111,24 @@ def by_plane(matched: F64, T_world_lidar: F64, noise2: float, usual2: float, mis
     likewise, which moves its place by the motion still expected (``miss2``, m2). This error of variance s is
     eliminated: H = sum A - b b' / (c + 1 / s).
     """
-    T = T_world_lidar
     H, g, J = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     b, br, c, total = np.zeros(6), 0.0, 0.0, 0.0
     for i in range(len(matched)):
-        px, py, pz, n0, n1, n2, nc, variance = matched[i, :8]
-        for k in range(3):
-            J[k] = n0 * T[0, k] + n1 * T[1, k] + n2 * T[2, k]
-        J[3], J[4], J[5] = py * J[2] - pz * J[1], pz * J[0] - px * J[2], px * J[1] - py * J[0]
-        r = J[0] * px + J[1] * py + J[2] * pz + n0 * T[0, 3] + n1 * T[1, 3] + n2 * T[2, 3] - nc
-        s2 = noise2 + variance
+        r = residual(matched[i], T_world_lidar, J)
+        s2 = noise2 + matched[i, VARIANCE]
         if r * r <= GATE2 * s2:
-            weight = (KERNEL2 / (KERNEL2 + r * r / s2)) ** 2 / s2
+            weight = geman_mcclure(r * r / s2) / s2
             c += weight
             br += weight * r
             for j in range(6):
                 b[j] += weight * J[j]
-            _add(H, g, J, r, weight)
+            accumulate(H, g, J, r, weight)
         if i + 1 == len(matched) or matched[i + 1, PLANE] != matched[i, PLANE]:
             mixed = _MIXED * max(matched[i, THICK] - usual2, 0.0)
             shared = (matched[i, PLACE] + mixed) * (1.0 + matched[i, TILT] * miss2)
             f = shared / (1.0 + c * shared)
             total += c - f * c * c
-            _add(H, g, b, br, -f)
+            accumulate(H, g, b, br, -f)
             b[:], br, c = 0.0, 0.0, 0.0
-    for j in range(6):
-        for k in range(j):
-            H[j, k] = H[k, j]
+    mirror(H)
     return ByPlane(H, g, total)
-
-
-@njit
-def _add(H: F64, g: F64, J: F64, r: float, weight: float) -> None:
-    """Add weight J' J to the upper triangle of ``H`` (6, 6) and weight J' r to ``g`` (6,)."""
-    for j in range(6):
-        g[j] += weight * r * J[j]
-        for k in range(j, 6):
-            H[j, k] += weight * J[j] * J[k]

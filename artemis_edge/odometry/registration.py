@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from artemis_edge._jit import njit
+from artemis_edge._jit import kernel, njit
 from artemis_edge.frames import F32, F64
 from artemis_edge.odometry import se3
 from artemis_edge.odometry.motion import Prediction
@@ -41,11 +41,11 @@ _CONVERGED_M = 1e-3  # mean displacement of the points by a step; a thirtieth of
 _REMATCH = 0.05  # displacement, as a share of the voxel in use, after which planes are looked up again
 GATE2 = 9.0  # three deviations
 _GRAZING2 = 0.05**2  # squared sine of incidence; a sheet seen edge-on is one laser line and its noise
-KERNEL2 = 4.0  # Geman-McClure: a residual of two deviations has a quarter of the weight
+_KERNEL2 = 4.0  # Geman-McClure: a residual of two deviations has a quarter of the weight
 # point in the lidar frame (3), normal (3), n . c (1), variance of the plane there (1), which plane (1), the variance
 # of its place (1), of its points (1), and by how much its tilts vary more, rad2/m2 (1)
 MATCH_COLUMNS = 12
-PLANE, PLACE, THICK, TILT = 8, 9, 10, 11
+VARIANCE, PLANE, PLACE, THICK, TILT = 7, 8, 9, 10, 11
 
 
 class Registration(NamedTuple):
@@ -173,7 +173,8 @@ def match_planes(
                 o[0], o[1], o[2] = px, py, pz
                 o[3], o[4], o[5] = w[NORMAL], w[NORMAL + 1], w[NORMAL + 2]
                 o[6] = o[3] * w[CENTRE] + o[4] * w[CENTRE + 1] + o[5] * w[CENTRE + 2]
-                o[7], o[PLANE], o[PLACE], o[THICK] = variance, slot, w[THICKNESS] / w[COUNT], w[THICKNESS]
+                o[VARIANCE], o[PLANE] = variance, slot
+                o[PLACE], o[THICK] = w[THICKNESS] / w[COUNT], w[THICKNESS]
                 o[TILT] = w[SPREAD] + w[SPREAD + 3] + w[SPREAD + 5]
                 n += 1
                 break
@@ -199,28 +200,54 @@ def _spread(row: F64, dx: float, dy: float, dz: float) -> float:
 @njit
 def linearise(matched: F64, T_world_lidar: F64, noise2: float) -> Linearised:
     """Robust normal equations of matched planes (m, 12); matches beyond three deviations have no weight."""
-    T = T_world_lidar
-    H, g, matches, total, score = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
-    J = np.empty(6)
+    H, g, J = np.zeros((6, 6)), np.zeros(6), np.empty(6)
+    matches, total, score = 0, 0.0, 0.0
     for i in range(len(matched)):
-        px, py, pz, n0, n1, n2, nc, variance = matched[i, :8]
-        for k in range(3):
-            J[k] = n0 * T[0, k] + n1 * T[1, k] + n2 * T[2, k]
-        J[3], J[4], J[5] = py * J[2] - pz * J[1], pz * J[0] - px * J[2], px * J[1] - py * J[0]
-        r = J[0] * px + J[1] * py + J[2] * pz + n0 * T[0, 3] + n1 * T[1, 3] + n2 * T[2, 3] - nc
-        s2 = noise2 + variance
+        r = residual(matched[i], T_world_lidar, J)
+        s2 = noise2 + matched[i, VARIANCE]
         if r * r > GATE2 * s2:
             continue
-        robust = (KERNEL2 / (KERNEL2 + r * r / s2)) ** 2
+        robust = geman_mcclure(r * r / s2)
         weight = robust / s2
         matches += 1
         total += weight
         score += robust
-        for a in range(6):
-            g[a] += weight * r * J[a]
-            for b in range(a, 6):
-                H[a, b] += weight * J[a] * J[b]
+        accumulate(H, g, J, r, weight)
+    mirror(H)
+    return Linearised(H, g, matches, total, score)
+
+
+@kernel
+def residual(row: F64, T_world_lidar: F64, J: F64) -> float:
+    """r of the module's formula, m, for a matched plane (12,); its derivatives go to ``J`` (6,)."""
+    T = T_world_lidar
+    # by index: unpacking a slice takes a quarter longer here
+    px, py, pz, n0, n1, n2, nc = row[0], row[1], row[2], row[3], row[4], row[5], row[6]
+    for k in range(3):
+        J[k] = n0 * T[0, k] + n1 * T[1, k] + n2 * T[2, k]
+    J[3], J[4], J[5] = py * J[2] - pz * J[1], pz * J[0] - px * J[2], px * J[1] - py * J[0]
+    r: float = J[0] * px + J[1] * py + J[2] * pz + n0 * T[0, 3] + n1 * T[1, 3] + n2 * T[2, 3] - nc
+    return r
+
+
+@kernel
+def geman_mcclure(r2: float) -> float:
+    """Share of its weight, 0..1, that a residual keeps; ``r2`` is its square in variances."""
+    return (_KERNEL2 / (_KERNEL2 + r2)) ** 2
+
+
+@kernel
+def accumulate(H: F64, g: F64, J: F64, r: float, weight: float) -> None:
+    """Add weight J' J to the upper triangle of ``H`` (6, 6) and weight J' r to ``g`` (6,)."""
+    for a in range(6):
+        g[a] += weight * r * J[a]
+        for b in range(a, 6):
+            H[a, b] += weight * J[a] * J[b]
+
+
+@kernel
+def mirror(H: F64) -> None:
+    """Copy the upper triangle of ``H`` (6, 6) to the lower."""
     for a in range(6):
         for b in range(a):
             H[a, b] = H[b, a]
-    return Linearised(H, g, matches, total, score)
