@@ -11,11 +11,11 @@ import numpy as np
 
 from artemis_edge._jit import njit
 from artemis_edge.frames import F64, Bool
+from artemis_edge.odometry.visual_patch import NEAREST_M
 
 _CELL = 8  # pixels of a cell of the depth grid
 _REACH = 2  # cells: half of a patch on the coarsest level, 16 pixels
 _FARTHEST = (_REACH + 1) * _CELL  # pixels from a patch's centre to what lies in those cells
-_NEAREST_M = 0.3
 _STEP_M = 0.1  # nearer than the patch by more is something else: three deviations of a point and a plane
 
 
@@ -28,7 +28,7 @@ def nearest_depth(points: F64, K: F64, width: int, height: int) -> F64:
     out = np.full((-(-height // _CELL), -(-width // _CELL)), np.inf)
     for n in range(len(points)):
         z = points[n, 2]
-        if not z > _NEAREST_M:
+        if not z > NEAREST_M:
             continue
         u, v = K[0] * points[n, 0] / z + K[2], K[1] * points[n, 1] / z + K[3]
         if 0.0 <= u < width and 0.0 <= v < height:
@@ -64,7 +64,7 @@ def partly_covered(centres: F64, normals: F64, nearest: F64, K: F64) -> Bool:
     rows, columns = nearest.shape
     for n in range(len(centres)):
         z = centres[n, 2]
-        if not z > _NEAREST_M:
+        if not z > NEAREST_M:
             continue
         limit = _least_depth(centres[n], normals[n], K) - _STEP_M
         row = int((K[1] * centres[n, 1] / z + K[3]) // _CELL)

@@ -20,8 +20,9 @@ from artemis_edge.odometry.path import Path, PoseAt
 from artemis_edge.odometry.plane_map import PlaneMap
 from artemis_edge.odometry.registration import match
 from artemis_edge.odometry.silhouette import nearest_depth, partly_covered
-from artemis_edge.odometry.state import NormalEquations, State, iterated_update
+from artemis_edge.odometry.state import ROTATION, NormalEquations, State, iterated_update
 from artemis_edge.odometry.visual_patch import (
+    NEAREST_M,
     SIDE,
     UNKNOWNS,
     Comparison,
@@ -140,9 +141,8 @@ class VisualUpdate:
             return state
         found = iterated_update(prior, measured, _ITERATIONS, 0.0)
         last = measured.compare(found, 0)
-        least = max(
-            _LEAST_SCORE, measured.compare(prior, 0).score, _OF_USUAL * self._usual(image.name, last.score)
-        )
+        usual = self._usual(image.name, last.score)
+        least = max(_LEAST_SCORE, measured.compare(prior, 0).score, _OF_USUAL * usual)
         if last.seen < _LEAST_PATCHES or last.score < least:
             self._count("images not believed")
             return prior
@@ -168,7 +168,7 @@ class VisualUpdate:
         kept.failed = np.where(share < 0.0, kept.failed, np.where(share < _FITS, kept.failed + 1, 0))
         kept = kept.only((kept.unseen < _UNSEEN) & (kept.failed < _FAILURES))
         self._kept[image.name] = kept
-        if np.sqrt(np.diag(state.P)[3:6].max()) > _OPEN_RAD:
+        if np.sqrt(np.diag(state.P)[ROTATION].max()) > _OPEN_RAD:
             return  # patches taken now would hold the error of the attitude for true
         T_world_lidar = path.at(state, 0.0).T_world_lidar
         T_cam_world = measured.T_cam_world(measured.pose(state))
@@ -331,7 +331,7 @@ def _cells(seen: Picture, T_cam_world: F64, points: F64) -> I64:
     p = points @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     height, width = seen.pyramid[0].shape
     fx, fy, cx, cy = seen.eyes[0].K
-    ahead = (p[:, 2] > 0.3) & (p[:, 2] < _FARTHEST_M)
+    ahead = (p[:, 2] > NEAREST_M) & (p[:, 2] < _FARTHEST_M)
     z = np.where(ahead, p[:, 2], 1.0)
     u, v = fx * p[:, 0] / z + cx, fy * p[:, 1] / z + cy
     inside = ahead & (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)

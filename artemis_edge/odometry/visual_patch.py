@@ -19,7 +19,8 @@ SIDE = 8
 RIM = SIDE + 2  # one more pixel on each side, for the gradients
 UNKNOWNS = 7  # right perturbation of T_world_lidar (6), log of the inverse exposure
 _PIXELS = SIDE * SIDE
-_NEAREST_M = 0.3
+# Nothing nearer to a camera is looked at: there a centimetre of its mount's error is some 20 pixels.
+NEAREST_M = 0.3
 _LEAST_AREA, _MOST_AREA = (
     0.15,
     8.0,
@@ -119,7 +120,7 @@ def seen_at(eye: Eye, T_cam_world: F64, anchor: F64, scale: float, warp: F64, P:
     small, too large or from behind.
     """
     x, y, z = transform(T_cam_world, anchor)
-    if not z > _NEAREST_M:
+    if not z > NEAREST_M:
         return False
     a, b, d = slope(x / z, y / z, eye.distortion)
     fx, fy = eye.K[0] / z, eye.K[1] / z
