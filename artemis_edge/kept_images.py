@@ -15,11 +15,11 @@ import numpy as np
 
 from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
-from artemis_edge.frames import F64, CameraImage, CameraModel, Trajectory
+from artemis_edge.frames import F64, CameraImage, Trajectory
 from artemis_edge.json_file import read_json
 from artemis_edge.progress import say
-from artemis_edge.session.photos import camera_of, file_of, photo_entry
-from artemis_edge.trajectory import covered, interpolate, inverse
+from artemis_edge.session.photos import camera_of, file_of, photo_entry, view_of
+from artemis_edge.trajectory import covered, interpolate
 
 FOLDER = "images"
 INDEX = "images.json"
@@ -55,11 +55,12 @@ class ImageSpool:
         if not source.is_file():
             return False
         camera, number = camera_of(source.name)
-        image = _image(camera, entry)
+        view = view_of(entry)
+        image = CameraImage(camera, int(entry.get("stamp_ns", 0)), b"", view.camera, np.eye(4))
         shutil.copyfile(source, self._folder / source.name)
         self._offered[camera] = max(self._offered.get(camera, 0), number + 1)
         self._kept.append((number, source.name, image))
-        self._placed[source.name] = inverse(np.array(entry["T_cam_world"], np.float64))
+        self._placed[source.name] = view.T_world_cam
         return True
 
     def add(self, image: CameraImage) -> None:
@@ -107,11 +108,3 @@ class ImageSpool:
         content = (json.dumps({"photos": entries}, indent=1) + "\n").encode()
         write_bytes(folder / INDEX, content)
         return size + len(content)
-
-
-def _image(camera: str, entry: dict[str, Any]) -> CameraImage:
-    """Without its bytes, in a frame of its own; the size of the picture is not in the index."""
-    k1, k2, p1, p2, k3 = (float(value) for value in entry["distortion"])
-    fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
-    model = CameraModel(0, 0, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-    return CameraImage(camera, int(entry.get("stamp_ns", 0)), b"", model, np.eye(4))

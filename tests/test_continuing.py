@@ -27,6 +27,7 @@ from artemis_edge.frames import (
     Trajectory,
 )
 from artemis_edge.keeper import Keeper
+from artemis_edge.kept_images import ImageSpool
 from artemis_edge.kept_points import open_points
 from artemis_edge.loop.correlation import Correlator
 from artemis_edge.loop.facets import Facets, facets_of
@@ -371,6 +372,32 @@ def test_damaged_indices_of_photographs_are_refused(damage: dict[str, object], t
         store.take_over(tmp_path)
     with pytest.raises(InputError, match="map the recording again"):
         list(photographs(tmp_path))
+
+
+def kept_images(folder: Path, *changes: dict[str, object]) -> Path:
+    """A map with an index of images, an entry for each change, and the one picture that they name otherwise."""
+    entry = {"file": "images/cam_000000.png", "stamp_ns": 5, "fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0}
+    entry |= {"distortion": [0.0] * 5, "T_cam_world": np.eye(4).tolist()}
+    (folder / "images").mkdir(parents=True)
+    (folder / "images" / "cam_000000.png").write_bytes(b"\x89PNG")
+    (folder / "images.json").write_text(json.dumps({"photos": [entry | change for change in changes]}))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"fx": float("nan")},
+        {"stamp_ns": float("inf")},
+        {"T_cam_world": np.zeros((4, 4)).tolist()},
+        {"distortion": [float("inf")] * 5},
+    ],
+)
+def test_a_damaged_index_of_kept_images_is_refused(damage: dict[str, object], tmp_path: Path) -> None:
+    (tmp_path / "spool").mkdir()
+    ImageSpool(tmp_path / "spool", 10).take_over(kept_images(tmp_path / "sound", {}))
+    with pytest.raises(InputError, match="make that map again"):
+        ImageSpool(tmp_path / "spool", 10).take_over(kept_images(tmp_path / "damaged", damage))
 
 
 def test_photographs_for_questions_that_are_gone_are_told(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,7 @@ import numpy as np
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, U8, CameraModel
 from artemis_edge.json_file import read_json
-from artemis_edge.lens import CAMERA_RULE, is_camera
-from artemis_edge.trajectory import inverse, is_pose
+from artemis_edge.session.photos import EntryError, view_of
 
 # A lens that leaves e^-10 of the light in its corners leaves none; far beyond it numbers overflow.
 _STEEPEST_FALLOFF = 10.0
@@ -74,24 +73,20 @@ def _entries(path: Path) -> list[Any]:
 def _photo(folder: Path, entry: Any, where: str) -> Photo:
     try:
         file = str(entry["file"])
-        fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
-        k1, k2, p1, p2, k3 = (float(k) for k in entry["distortion"])
-        T_cam_world = np.array(entry["T_cam_world"], np.float64)
+        view = view_of(entry)
         falloff = tuple(float(a) for a in entry.get("falloff", ()))
+    except EntryError as error:
+        raise InputError(f"{where}: {error}") from None
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
         raise InputError(
             f"{where} is not complete; it needs file, fx, fy, cx, cy, distortion and T_cam_world"
         ) from None
-    if not np.isfinite([k1, k2, p1, p2, k3]).all() or not is_camera(fx, fy, cx, cy):
-        raise InputError(f"{where}: the distortion must be finite, and {CAMERA_RULE}")
     if not all(abs(a) <= _STEEPEST_FALLOFF for a in falloff):
         raise InputError(f"{where}: its falloff is no lens's; coefficients are at most {_STEEPEST_FALLOFF:g}")
-    if not is_pose(T_cam_world):
-        raise InputError(f"{where}: T_cam_world is not a rotation and a translation as a 4 x 4 matrix")
     image = read_image(folder / file)
     height, width = image.shape[:2]
-    camera = CameraModel(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-    return Photo(file, image, camera, inverse(T_cam_world), falloff)
+    camera = replace(view.camera, width=width, height=height)
+    return Photo(file, image, camera, view.T_world_cam, falloff)
 
 
 def read_image(path: Path) -> U8:

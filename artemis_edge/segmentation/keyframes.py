@@ -22,13 +22,12 @@ from artemis_edge.errors import InputError
 from artemis_edge.export.atomic import write_bytes
 from artemis_edge.frames import F32, F64, U8, CameraImage, CameraModel
 from artemis_edge.json_file import read_json
-from artemis_edge.lens import CAMERA_RULE, is_camera
 from artemis_edge.progress import Report, say, silent
 from artemis_edge.segmentation.backend import Backend, Prompt, Segmentation
 from artemis_edge.segmentation.trial import decode
-from artemis_edge.session.photos import file_of
+from artemis_edge.session.photos import file_of, view_of
 from artemis_edge.sight import Sight
-from artemis_edge.trajectory import inverse, is_pose
+from artemis_edge.trajectory import inverse
 
 FOLDER = "keyframes"
 INDEX = "index.json"
@@ -310,21 +309,15 @@ def _indices(map_folder: Path) -> tuple[Path, Path]:
 
 def _keyframe(folder: Path, row: dict[str, Any]) -> Keyframe:
     path = _inside(folder, row["file"])
-    T_cam_world = np.array(row["T_cam_world"], np.float64)
-    k1, k2, p1, p2, k3 = (float(value) for value in row["distortion"])
-    if not is_pose(T_cam_world):
-        raise ValueError("a pose is not a rotation and a translation as a 4 x 4 matrix")
+    view = view_of(row, "a pose")
     width, height = int(row.get("width", 0)), int(row.get("height", 0))
     if not width or not height:
         pixels = decode(path.read_bytes())
         height, width = (0, 0) if pixels is None else pixels.shape[:2]
-    fx, fy, cx, cy = (float(row[key]) for key in ("fx", "fy", "cx", "cy"))
-    if not is_camera(fx, fy, cx, cy) or not np.isfinite([k1, k2, p1, p2, k3]).all():
-        raise ValueError(f"the distortion must be finite, and {CAMERA_RULE}")
-    model = CameraModel(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+    model = replace(view.camera, width=width, height=height)
     camera, stamp = str(row.get("camera", path.stem)), int(row.get("stamp_ns", 0))
     depth = _inside(folder, row["depth"]) if row.get("depth") else None
-    return Keyframe(path, camera, stamp, model, inverse(T_cam_world), depth)
+    return Keyframe(path, camera, stamp, model, view.T_world_cam, depth)
 
 
 def _inside(folder: Path, name: object) -> Path:

@@ -1,4 +1,4 @@
-"""Photographs kept out of the map, written with their poses: PHOTOS.json, for ``evaluate texture``."""
+"""PHOTOS.json: its entries, and photographs kept out of the map, written with their poses for ``evaluate texture``."""
 
 from __future__ import annotations
 
@@ -7,20 +7,40 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote, unquote
 
 import numpy as np
 
 from artemis_edge.export.atomic import write_bytes
-from artemis_edge.frames import F64, CameraImage, Odometry, SyncedFrame, TrackedFrame, Trajectory
-from artemis_edge.trajectory import covered, interpolate, inverse
+from artemis_edge.frames import (
+    F64,
+    CameraImage,
+    CameraModel,
+    Odometry,
+    SyncedFrame,
+    TrackedFrame,
+    Trajectory,
+)
+from artemis_edge.lens import CAMERA_RULE, is_camera
+from artemis_edge.trajectory import covered, interpolate, inverse, is_pose
 
 INDEX = "PHOTOS.json"
 FOLDER = "photos"
 # The names that ``HeldOut`` gives: camera and number.
 _NAMED = re.compile(r".+_\d{6,}\.(png|jpg)")
 _PNG_MAGIC = b"\x89PNG"
+
+
+class EntryError(ValueError):
+    """An entry of an index is complete, but its numbers are those of no camera or no pose."""
+
+
+class View(NamedTuple):
+    """What an entry says of a photograph: its camera, without a size (0 x 0), and ``T_world_cam`` (4, 4)."""
+
+    camera: CameraModel
+    T_world_cam: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,3 +181,19 @@ def photo_entry(file: str, image: CameraImage, T_world_lidar: F64) -> dict[str, 
         "distortion": list(model.distortion),
         "T_cam_world": T_cam_world,
     }
+
+
+def view_of(entry: Any, pose: str = "T_cam_world") -> View:
+    """Camera and pose of an entry that :func:`photo_entry` made, or another program.
+
+    Raises EntryError, whose sentence calls the matrix ``pose``, where the numbers cannot be; AttributeError, KeyError,
+    OverflowError, TypeError or another ValueError where the entry is not complete.
+    """
+    fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
+    k1, k2, p1, p2, k3 = (float(k) for k in entry["distortion"])
+    T_cam_world = np.array(entry["T_cam_world"], np.float64)
+    if not is_camera(fx, fy, cx, cy) or not np.isfinite([k1, k2, p1, p2, k3]).all():
+        raise EntryError(f"the distortion must be finite, and {CAMERA_RULE}")
+    if not is_pose(T_cam_world):
+        raise EntryError(f"{pose} is not a rotation and a translation as a 4 x 4 matrix")
+    return View(CameraModel(0, 0, fx, fy, cx, cy, (k1, k2, p1, p2, k3)), inverse(T_cam_world))
