@@ -1,6 +1,8 @@
 """Likeness to photographs against slow formulas, and the command from a map with points and images."""
 
 import json
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -309,6 +311,17 @@ def test_photos_of_no_use_are_refused(room: Path, change: dict[str, object], sen
     content["photos"][0] |= change
     (room / "PHOTOS.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=sentence):
+        run(room, room / "PHOTOS.json")
+
+
+def test_a_picture_larger_than_any_is_refused(room: Path) -> None:
+    """Its header is whole, so that the decoder does not return nothing but raises."""
+    path = room / json.loads((room / "PHOTOS.json").read_text())["photos"][0]["file"]
+    header = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
+    path.write_bytes(
+        path.read_bytes()[:12] + header + struct.pack(">I", zlib.crc32(header)) + path.read_bytes()[33:]
+    )
+    with pytest.raises(InputError, match="not a picture that can be decoded"):
         run(room, room / "PHOTOS.json")
 
 

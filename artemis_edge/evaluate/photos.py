@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-
 from artemis_edge.errors import InputError
 from artemis_edge.frames import F64, U8, CameraModel
 from artemis_edge.json_file import read_json
+from artemis_edge.segmentation.trial import decode
 from artemis_edge.session.photos import EntryError, view_of
 
 # A lens that leaves e^-10 of the light in its corners leaves none; far beyond it numbers overflow.
@@ -100,8 +98,7 @@ def read_image(path: Path) -> U8:
 
 def decoded(content: bytes, name: str) -> U8:
     """An encoded picture as RGB uint8 (h, w, 3); PictureError naming it if it is none."""
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    image = decode(content)
     if image is None:
         raise PictureError(f"{name} is not a picture that can be decoded; take it out or copy it again")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    return image
