@@ -37,31 +37,40 @@ class ImageSpool:
 
     def take_over(self, folder: Path) -> None:
         """Begin with the images of a map made before; InputError where their index is damaged."""
-        index = folder / INDEX
+        index, missing, repeated = folder / INDEX, list[str](), list[str]()
+        taken = set[tuple[str, int]]()  # by camera and number, which thinning must tell apart
         try:
             entries = read_json(index)["photos"] if index.is_file() else []
-            there = [self._take(folder / str(entry["file"]), entry) for entry in entries]
+            for entry in entries:
+                source = folder / str(entry["file"])
+                if not source.is_file():
+                    missing.append(source.name)
+                elif (which := camera_of(source.name)) in taken:
+                    repeated.append(source.name)
+                else:
+                    taken.add(which)
+                    self._take(source, entry, *which)
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
             raise InputError(f"{index} is damaged; make that map again") from None
-        if not all(there):
-            missing = len(there) - sum(there)
+        if missing:
             say(
-                f"{missing} of the {len(there)} photographs that {index} names are missing; it goes on without them"
+                f"{len(missing)} of the {len(entries)} photographs that {index} names are missing; "
+                "it goes on without them"
+            )
+        if repeated:
+            say(
+                f"{len(repeated)} entries of {index} name a photograph again, the first: {repeated[0]}; "
+                "it keeps the first entry of each"
             )
         self._thin()
 
-    def _take(self, source: Path, entry: dict[str, Any]) -> bool:
-        """Whether the image is there."""
-        if not source.is_file():
-            return False
-        camera, number = camera_of(source.name)
+    def _take(self, source: Path, entry: dict[str, Any], camera: str, number: int) -> None:
         view = view_of(entry)
         image = CameraImage(camera, int(entry.get("stamp_ns", 0)), b"", view.camera, np.eye(4))
         shutil.copyfile(source, self._folder / source.name)
         self._offered[camera] = max(self._offered.get(camera, 0), number + 1)
         self._kept.append((number, source.name, image))
         self._placed[source.name] = view.T_world_cam
-        return True
 
     def add(self, image: CameraImage) -> None:
         """Write the image, or leave it out."""

@@ -400,6 +400,25 @@ def test_a_damaged_index_of_kept_images_is_refused(damage: dict[str, object], tm
         ImageSpool(tmp_path / "spool", 10).take_over(kept_images(tmp_path / "damaged", damage))
 
 
+def test_of_two_entries_of_one_kept_image_the_first_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "spool").mkdir()
+    (tmp_path / "next").mkdir()
+    folder = kept_images(
+        tmp_path / "map", {}, {"fx": 7.0}, {"file": "images/cam_0.png"}, {"file": "images/cam_1.png"}
+    )
+    (folder / "images" / "cam_0.png").write_bytes(b"the same camera and number")
+    spool = ImageSpool(tmp_path / "spool", 1)
+    spool.take_over(folder)
+    said = capsys.readouterr().err
+    assert "2 entries of" in said and "cam_000000.png" in said and "keeps the first entry" in said
+    assert "1 of the 4 photographs" in said
+    spool.save(tmp_path / "next", Trajectory(np.array([0, 10**9]), np.stack([np.eye(4)] * 2)))
+    (entry,) = json.loads((tmp_path / "next" / "images.json").read_text())["photos"]
+    assert entry["fx"] == 5.0 and (tmp_path / "next" / entry["file"]).read_bytes() == b"\x89PNG"
+
+
 def test_photographs_for_questions_that_are_gone_are_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
