@@ -12,7 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
+from artemis_edge.cli import main
 from artemis_edge.errors import InputError, RunError
+from artemis_edge.export.mesh import bare_mesh
+from artemis_edge.export.ply import write_ply
 from artemis_edge.frames import F64, U8, CameraImage, CameraModel
 from artemis_edge.segmentation.backend import Backend, Prompt, Segmentation, Status, Support
 from artemis_edge.segmentation.engine import HereEngine, Job, ProcessEngine, Result, run_job
@@ -422,6 +425,20 @@ def test_maps_without_photographs(tmp_path: Path) -> None:
         (tmp_path / "keyframes/index.json").write_text(content)
         with pytest.raises(InputError, match="map the recording again"):
             read_keyframes(tmp_path)
+
+
+def test_an_index_that_names_no_photographs_is_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    index = tmp_path / "map" / "keyframes" / "index.json"
+    index.parent.mkdir(parents=True)
+    index.write_text('{"photos": []}')
+    write_ply(tmp_path / "mesh.ply", bare_mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)))
+    assert main(["ask", str(tmp_path), "car"]) == 2
+    assert "has no photographs to look at" in capsys.readouterr().err
+    store = KeyframeStore(tmp_path / "scratch", APART, 10_000_000)
+    store.take_over(tmp_path / "map")  # nothing to begin with is nothing to complain about
+    assert len(store) == 0
 
 
 def test_photographs_kept_by_others_are_used(tmp_path: Path) -> None:

@@ -267,17 +267,26 @@ def read_keyframes(map_folder: Path) -> list[Keyframe]:
 
     Raises InputError where none were kept or the index cannot be read.
     """
-    for index in _indices(map_folder):
-        if index.is_file():
-            try:
-                rows = read_json(index)["photos"]
-                found = [_keyframe(index.parent, row) for row in rows]
-            except (AttributeError, ValueError, KeyError, OverflowError, TypeError, OSError) as error:
-                raise InputError(f"{index} cannot be read ({error}); map the recording again") from None
+    found = _indexed(map_folder)
+    if not found:
+        raise InputError(
+            f"{map_folder} has no photographs to look at; map a recording that has images, with --query TEXT"
+        )
+    return found
+
+
+def _indexed(map_folder: Path) -> list[Keyframe]:
+    """The photographs of the first index that names some, in order of time; none where none does."""
+    for index in (map_folder / FOLDER / INDEX, map_folder / _OTHER_INDEX):
+        if not index.is_file():
+            continue
+        try:
+            found = [_keyframe(index.parent, row) for row in read_json(index)["photos"]]
+        except (AttributeError, ValueError, KeyError, OverflowError, TypeError, OSError) as error:
+            raise InputError(f"{index} cannot be read ({error}); map the recording again") from None
+        if found:
             return sorted(found, key=lambda item: (item.stamp_ns, item.camera))
-    raise InputError(
-        f"{map_folder} has no photographs to look at; map a recording that has images, with --query TEXT"
-    )
+    return []
 
 
 def photographs(map_folder: Path) -> Iterator[tuple[CameraImage, F64]]:
@@ -292,19 +301,13 @@ def photographs(map_folder: Path) -> Iterator[tuple[CameraImage, F64]]:
 def _readable(
     map_folder: Path, missing: Callable[[str], None] = lambda sentence: None
 ) -> Iterator[tuple[Keyframe, CameraImage]]:
-    if not any(index.is_file() for index in _indices(map_folder)):
-        return
-    for k in read_keyframes(map_folder):
+    for k in _indexed(map_folder):
         try:
             encoded = k.file.read_bytes()
         except OSError as error:
             missing(f"{k.file} ({error.strerror})")
             continue
         yield k, CameraImage(k.camera, k.stamp_ns, encoded, k.model, np.eye(4))
-
-
-def _indices(map_folder: Path) -> tuple[Path, Path]:
-    return map_folder / FOLDER / INDEX, map_folder / _OTHER_INDEX
 
 
 def _keyframe(folder: Path, row: dict[str, Any]) -> Keyframe:
