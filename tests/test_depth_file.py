@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -79,6 +81,17 @@ def test_what_is_no_depth_of_this_camera_is_refused() -> None:
     beyond = np.full((4 * view.depth.shape[0], view.depth.shape[1]), 65535, np.uint16)
     with pytest.raises(InputError, match="depths beyond any map"):
         decode_depth(bytes(cv2.imencode(".png", beyond)[1]), view.lens)
+
+
+def test_the_size_is_refused_before_anything_is_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = some_depth()
+    whole = encode_depth(view.depth, view.lens)
+    header = b"IHDR" + struct.pack(">II", 16_000, 16_000) + whole[24:29]
+    vast = whole[:12] + header + struct.pack(">I", zlib.crc32(header)) + whole[33:]
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    for content in (vast, whole[:20], b"BM" + whole[2:]):
+        with pytest.raises(InputError, match="is not a depth map of"):
+            decode_depth(content, view.lens)
 
 
 def test_where_nothing_was_known_what_is_known_now_stands() -> None:
