@@ -60,9 +60,9 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     note: str = ""
 
     def __post_init__(self) -> None:
-        fine = self.fine_input_size
-        if fine is not None and (fine[0] < self.input_size[0] or fine[1] < self.input_size[1]):
-            raise ValueError("fine_input_size is smaller than input_size")
+        fine, size = self.fine_input_size, self.input_size
+        if fine is not None and (fine == size or fine[0] < size[0] or fine[1] < size[1]):
+            raise ValueError("fine_input_size is smaller than input_size, or the same")
 
 
 def read_manifest(path: Path) -> Manifest:

@@ -197,14 +197,13 @@ def _with_fine_size(said: Manifest, network: Network, fine: tuple[int, int] | No
         raise InputError(
             f"{network.file} takes images of one size only; leave --fine-input-size out, or export it with open sides"
         )
-    if not any(fine[k] > said.input_size[k] for k in (0, 1)) or any(
-        fine[k] < said.input_size[k] for k in (0, 1)
-    ):
+    try:
+        return msgspec.structs.replace(said, fine_input_size=fine)
+    except ValueError:
         ours, theirs = ("x".join(map(str, size)) for size in (fine, said.input_size))
         raise InputError(
             f"--fine-input-size {ours} is not finer than the input size {theirs}; give a larger one"
-        )
-    return msgspec.structs.replace(said, fine_input_size=fine)
+        ) from None
 
 
 def _part_of(role: str, path: Path, sha256: str) -> Part:
