@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from artemis_edge.block_store import CLASSES, LOG_CLASS, WEIGHT, Store
+from artemis_edge.block_store import CLASSES, LOG_CLASS, NORMAL, WEIGHT, Store
 from artemis_edge.class_rows import CLEAR_LOG
 from artemis_edge.config import SemanticsConfig
 from artemis_edge.errors import InputError
@@ -20,6 +20,7 @@ from artemis_edge.export.mesh import edges_of
 from artemis_edge.forgetting import Forgotten, forget_blocks
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraImage
 from artemis_edge.map_view import MapView, visibility
+from artemis_edge.measured import RecentScans, Scratch, Shown, scope_of, see_measured
 from artemis_edge.paging import resident_blocks
 from artemis_edge.refinement.agreement import agreed
 from artemis_edge.refinement.semantics import labels_of, refine
@@ -73,8 +74,11 @@ class SemanticMap:
         self.view = MapView(config, store, voxel_m)
         self._spacing_m = voxel_m / 4
         self._seen = self.view.seen
+        self.scans = RecentScans()
         self._sampled = np.empty((len(store.state), CLASSES), np.float32)
         self._scratch = np.empty(CLASSES, np.float32)
+        self._points = Scratch(np.zeros(len(store.state), np.int32), np.empty(NORMAL + 3, np.float32))
+        self._depth = np.empty((0, 0, 4), np.float32)
         self.probability = np.empty(0, np.float32)
 
     def ask(self, names: Sequence[str]) -> None:
@@ -119,12 +123,13 @@ class SemanticMap:
         T_world_cam = T_world_lidar @ inverse(image.T_cam_lidar)
         if not self.asked:
             return without_depth(new_sight(image.model, T_world_cam))
-        return self.view.sight(image.model, T_world_cam)
+        view = self.view.sight(image.model, T_world_cam)
+        return view._replace(measured=self.scans.in_view(view, self.config.reach_m))
 
     def fuse(self, mask: LateMask, stamp: int) -> int:
         """Voxel fusion (eq. 1) of a mask; returns how many vertices it sees."""
         n, lens = self.view.look(mask.sight), mask.sight.lens
-        depth = filled(mask.sight.depth, self.view.depth(n, lens))
+        depth = self._depth = filled(mask.sight.depth, self.view.depth(n, lens))
         n = int(keep_visible(self._seen, n, cell_px(lens), depth, visibility(self.config)))
         sampled = self._rows(n, mask.scores)
         sample_scores(self._seen, n, mask.scores.score, grid_of(mask.scores), sampled)
@@ -140,19 +145,25 @@ class SemanticMap:
         return n
 
     def refine(self, mask: LateMask, n: int, stamp: int) -> int:
-        """Semantic refinement (eqs 12, 13) by the mask that was fused last and saw ``n`` vertices."""
-        return int(
-            refine(
-                self.store,
-                self._seen,
-                n,
-                self._rows(n, mask.scores),
-                slot_layers(mask.scores),
-                self._seen.reliability,
-                stamp,
-                self._scratch,
-            )
-        )
+        """Semantic refinement (eqs 12, 13) by the mask that was fused last and saw ``n`` vertices.
+
+        They are refined by what their own pixels show, and those that beams have just met by what the pixels of the
+        points show; returns how many observations that is.
+        """
+        slots, seen = slot_layers(mask.scores), self._seen
+        rows = self._rows(n, mask.scores)
+        told = refine(self.store, seen, n, rows, slots, seen.reliability, stamp, self._scratch)
+        return int(told) + self._refine_measured(mask, slots, stamp)
+
+    def _refine_measured(self, mask: LateMask, slots: I32, stamp: int) -> int:
+        sight, seen = mask.sight._replace(depth=self._depth), self._seen
+        scope = scope_of(sight.lens, self.config.reach_m, self._spacing_m)
+        scores = mask.scores
+        shown = Shown(scores.score, grid_of(scores), np.array(scores.slots, np.int32))
+        mean = self._rows(len(seen.slot), scores)
+        n = see_measured(self.store, sight.measured, sight, scope, shown, self._points, seen, mean)
+        weight = seen.reliability
+        return int(refine(self.store, seen, n, mean[:n], slots, weight, stamp, self._scratch))
 
     def finished_labels(self, lam: F32, vertices: F32, normals: F32, faces: I32) -> U8:
         """Labels (n,) of a finished mesh from log-probabilities (n, CLASSES), refined by what neighbours agree on.

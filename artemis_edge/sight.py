@@ -33,6 +33,7 @@ LEAST_COSINE = 0.05
 # Depth errors of so many sigma_geom weigh nothing (below 4e-6): spares the exponential
 _NO_WEIGHT = 5.0
 _IN_THE_WAY_M = 1e-3
+_NOT_MEASURED = np.empty((0, 4), np.float32)
 _SPLAT = 0.75  # radius of a splat in point spacings: neighbouring splats overlap and leave no hole
 
 
@@ -43,12 +44,14 @@ class Sight(NamedTuple):
     radius within which the lens model holds; ``tangent`` float64 (4,): x / z and y / z, least and most, that the
     image can show; ``depth`` float32 (h, w, 4) the reference depth: the surface nearest to the camera as a plane, with
     columns DEPTH (inf where nothing is known), INVERSE, RIGHT and DOWN; one cell for every :func:`cell_px` pixels.
+    ``measured`` float32 (n, 4) are the points that beams met around the image's time (measured.py).
     """
 
     T_cam_world: F64
     lens: F64
     tangent: F64
     depth: F32
+    measured: F32
 
 
 class Seen(NamedTuple):
@@ -91,7 +94,9 @@ def new_sight(camera: CameraModel, T_world_cam: F64) -> Sight:
     lens[11] = min(fold_radius(lens[4:9]) ** 2, 1e6)
     u, v = np.array([0.0, camera.width - 1]), np.array([0.0, camera.height - 1])
     tangent = np.array([*(u - camera.cx) / camera.fx, *(v - camera.cy) / camera.fy]) * _FRUSTUM_MARGIN
-    return Sight(np.ascontiguousarray(inverse(T_world_cam)[:3]), lens, tangent, empty_depth(lens))
+    return Sight(
+        np.ascontiguousarray(inverse(T_world_cam)[:3]), lens, tangent, empty_depth(lens), _NOT_MEASURED.copy()
+    )
 
 
 def cell_px(lens: F64) -> float:
@@ -109,7 +114,7 @@ def empty_depth(lens: F64) -> F32:
 
 def without_depth(sight: Sight) -> Sight:
     """The view alone: some hundred bytes, of which thousands can be kept."""
-    return sight._replace(depth=np.empty((0, 0, 4), np.float32))
+    return sight._replace(depth=np.empty((0, 0, 4), np.float32), measured=_NOT_MEASURED.copy())
 
 
 def filled(then: F32, now: F32) -> F32:
@@ -170,7 +175,7 @@ def list_seen(
                 c = bs.lowest_bit(mask)
                 mask &= mask - np.uint64(1)
                 s = store.voxel_cell[voxel, c]
-                if store.state[s] != ALIVE or not _project(store.vertex[s], T, lens, reach_m, seen, n):
+                if store.state[s] != ALIVE or not project(store.vertex[s], T, lens, reach_m, seen, n):
                     continue
                 if depth.size > 0 and not _is_visible(seen, n, size_px, depth, rules):
                     continue
@@ -185,7 +190,7 @@ def see_rows(vertex: F32, T: F64, lens: F64, reach_m: float, seen: Seen) -> int:
     """The vertices ``vertex`` float32 (n, 6), position and normal, that a view shows; ``slot`` is the row."""
     n = 0
     for row in range(vertex.shape[0]):
-        if _project(vertex[row], T, lens, reach_m, seen, n):
+        if project(vertex[row], T, lens, reach_m, seen, n):
             seen.slot[n] = row
             n += 1
     return n
@@ -217,7 +222,7 @@ def _touches_view(index: I32, planes: F64, edge_m: float) -> bool:
 
 
 @kernel
-def _project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> bool:
+def project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> bool:
     """Pixel, depth and cosine of a vertex into row ``n``; False when the image does not show it."""
     px, py, pz = np.float64(p[POSITION]), np.float64(p[POSITION + 1]), np.float64(p[POSITION + 2])
     z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
@@ -230,9 +235,7 @@ def _project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> b
     r2 = x * x + y * y
     if r2 > lens[11]:
         return False
-    radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
-    u = lens[0] * (x * radial + 2.0 * lens[6] * x * y + lens[7] * (r2 + 2.0 * x * x)) + lens[2]
-    v = lens[1] * (y * radial + lens[6] * (r2 + 2.0 * y * y) + 2.0 * lens[7] * x * y) + lens[3]
+    u, v = pixel_of(x, y, lens)
     if not (u > -0.5 and v > -0.5 and u < lens[9] - 0.5 and v < lens[10] - 0.5):
         return False
     gx, gy, gz = np.float64(p[NORMAL]), np.float64(p[NORMAL + 1]), np.float64(p[NORMAL + 2])
@@ -249,6 +252,16 @@ def _project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> b
     seen.right[n] = slope * nx / lens[0]
     seen.down[n] = slope * ny / lens[1]
     return True
+
+
+@kernel
+def pixel_of(x: float, y: float, lens: F64) -> tuple[float, float]:
+    """Pixel of the sight line (x / z, y / z) through a ``Sight.lens``."""
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
+    u = lens[0] * (x * radial + 2.0 * lens[6] * x * y + lens[7] * (r2 + 2.0 * x * x)) + lens[2]
+    v = lens[1] * (y * radial + lens[6] * (r2 + 2.0 * y * y) + 2.0 * lens[7] * x * y) + lens[3]
+    return u, v
 
 
 @kernel
@@ -303,6 +316,12 @@ def _is_visible(seen: Seen, i: int, size_px: float, depth: F32, rules: Visibilit
 @kernel
 def _depth_error(seen: Seen, i: int, size_px: float, depth: F32) -> float:
     """|depth - reference depth| of row ``i``, 0 where no reference is known."""
+    return float(abs(depth_ahead(seen, i, size_px, depth)))
+
+
+@kernel
+def depth_ahead(seen: Seen, i: int, size_px: float, depth: F32) -> float:
+    """How far the reference depth map is before row ``i`` at its very pixel [m]; 0 where no reference is known."""
     row = min(max(int(seen.v[i] / size_px + 0.5), 0), depth.shape[0] - 1)
     column = min(max(int(seen.u[i] / size_px + 0.5), 0), depth.shape[1] - 1)
     cell = depth[row, column]
@@ -311,4 +330,4 @@ def _depth_error(seen: Seen, i: int, size_px: float, depth: F32) -> float:
     du, dv = seen.u[i] - column * size_px, seen.v[i] - row * size_px
     inverse = cell[INVERSE] + cell[RIGHT] * du + cell[DOWN] * dv
     reference = min(max(1.0 / max(inverse, 1e-6), cell[DEPTH] / _FARTHEST), cell[DEPTH] * _FARTHEST)
-    return float(abs(seen.z[i] - reference))
+    return float(seen.z[i] - reference)
