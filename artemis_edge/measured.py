@@ -303,7 +303,7 @@ def _class_before(store: Store, row: F32, sight: Sight, share: float, r: float) 
     _, slot = vertex_at(store, x, y, z, r)
     for k in range(1, 8):
         if slot >= 0 and not is_blank(store.attribute[slot]):
-            return best_class(store.attribute[slot])
+            return int(best_class(store.attribute[slot]))
         # then the cells beside it
         step = r if k % 2 else -r
         dx, dy, dz = step * (k < 3), step * (k == 3 or k == 4), step * (k > 4)
