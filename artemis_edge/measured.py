@@ -9,7 +9,6 @@ aside. That is judged among the points themselves, within the width by which out
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import NamedTuple
 
 import cv2
@@ -34,8 +33,6 @@ from artemis_edge.sight import (
     project,
 )
 
-# Frames whose scans count: photographs are segmented at half the rate of frames or less
-FRAMES = 2
 # Columns of measured points: place in world [m], and the depth of the nearest point around its pixel [m]
 X, FRONT = 0, 3
 COLUMNS = 4
@@ -68,21 +65,20 @@ def scope_of(lens: F64, reach_m: float, cell_m: float) -> Scope:
     return Scope(reach_m, cell_m, _cell_px(lens) * (REACH_CELLS + 0.5), cell_px(lens))
 
 
-class RecentScans:
-    """The scans of the last frames, and what of them an image shows."""
+class LatestScans:
+    """The scans of the latest frame, and what of them an image shows."""
 
     def __init__(self) -> None:
-        self._frames: deque[TrackedFrame] = deque(maxlen=FRAMES)
+        self._frame: TrackedFrame | None = None
 
-    def add(self, frame: TrackedFrame) -> None:
-        """A frame that has been tracked."""
-        self._frames.append(frame)
+    def take(self, frame: TrackedFrame) -> None:
+        """A frame that has been tracked; the one before is forgotten."""
+        self._frame = frame
 
     def in_view(self, sight: Sight, reach_m: float) -> F32:
-        """Points float32 (n, COLUMNS) that ``sight`` shows within ``reach_m``, of later frames first."""
-        scans = [
-            (scan.points, frame.T_world_lidar) for frame in reversed(self._frames) for scan in frame.scans
-        ]
+        """Points float32 (n, COLUMNS) that ``sight`` shows within ``reach_m``, sorted by place."""
+        frame = self._frame
+        scans = () if frame is None else tuple((scan.points, frame.T_world_lidar) for scan in frame.scans)
         room = sum(len(points) for points, _ in scans)
         rows, cell = np.empty((room, COLUMNS), np.float32), np.empty(room, np.int32)
         size = _cell_px(sight.lens)

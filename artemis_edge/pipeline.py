@@ -190,7 +190,7 @@ class Pipeline:
         if self.segmenter is None or self.semantics is None:
             return
         with self._stage("segmentation"):
-            self.semantics.scans.add(tracked)
+            self.semantics.scans.take(tracked)
             for image, T_world_lidar in zip(tracked.images, tracked.image_poses, strict=True):
                 self.segmenter.offer(image, partial(self.semantics.sight, image, T_world_lidar))
 

@@ -20,7 +20,7 @@ from artemis_edge.export.mesh import edges_of
 from artemis_edge.forgetting import Forgotten, forget_blocks
 from artemis_edge.frames import F32, F64, I32, U8, Bool, CameraImage
 from artemis_edge.map_view import MapView, visibility
-from artemis_edge.measured import RecentScans, Scratch, Shown, scope_of, see_measured
+from artemis_edge.measured import LatestScans, Scratch, Shown, scope_of, see_measured
 from artemis_edge.paging import resident_blocks
 from artemis_edge.refinement.agreement import agreed
 from artemis_edge.refinement.semantics import labels_of, refine
@@ -74,7 +74,7 @@ class SemanticMap:
         self.view = MapView(config, store, voxel_m)
         self._spacing_m = voxel_m / 4
         self._seen = self.view.seen
-        self.scans = RecentScans()
+        self.scans = LatestScans()
         self._sampled = np.empty((len(store.state), CLASSES), np.float32)
         self._scratch = np.empty(CLASSES, np.float32)
         self._points = Scratch(np.zeros(len(store.state), np.int32), np.empty(NORMAL + 3, np.float32))

@@ -14,7 +14,6 @@ from artemis_edge.config import SemanticsConfig
 from artemis_edge.frames import F32, F64, U8, CameraImage, CameraModel, DeskewedScan, TrackedFrame
 from artemis_edge.measured import (
     ENOUGH,
-    FRAMES,
     FRONT,
     HOLLOW_M,
     NEAR_BY_M,
@@ -22,7 +21,7 @@ from artemis_edge.measured import (
     ROUGH_M,
     ROUGH_SHARE,
     THIN_M,
-    RecentScans,
+    LatestScans,
     Scratch,
     Shown,
     in_blocks,
@@ -44,10 +43,10 @@ def frame(*points: F32, T: F64 | None = None) -> TrackedFrame:
     return TrackedFrame(0, 0, np.eye(4) if T is None else T, scans)
 
 
-def scans_of(*frames: TrackedFrame) -> RecentScans:
-    out = RecentScans()
+def scans_of(*frames: TrackedFrame) -> LatestScans:
+    out = LatestScans()
     for one in frames:
-        out.add(one)
+        out.take(one)
     return out
 
 
@@ -96,7 +95,7 @@ def test_points_close_together_are_thinned_out_and_those_of_no_use_left_out() ->
     found = scans_of(frame(close, useless, apart)).in_view(sight, REACH_M)
     kept = np.concatenate((close[:ENOUGH], apart))
     np.testing.assert_allclose(found[np.lexsort(found.T[:3]), :3], kept[np.lexsort(kept.T)], atol=1e-6)
-    assert RecentScans().in_view(sight, REACH_M).shape == (0, 4)
+    assert LatestScans().in_view(sight, REACH_M).shape == (0, 4)
     assert scans_of(frame(np.empty((0, 3)))).in_view(sight, REACH_M).shape == (0, 4)
 
 
@@ -113,12 +112,12 @@ def test_rows_are_sorted_by_place_and_none_is_lost() -> None:
     assert in_blocks(rows[:0]).shape == (0, 4)
 
 
-def test_the_last_frames_count_each_at_its_own_pose() -> None:
+def test_the_latest_frame_counts_at_its_own_pose() -> None:
     moved = np.eye(4)
     moved[0, 3] = 1.0
-    frames = [frame(np.array([[0.0, 0.0, 5.0 + k]]), T=moved) for k in range(FRAMES + 2)]
+    frames = [frame(np.array([[0.0, 0.0, 5.0 + k]]), T=moved) for k in range(3)]
     found = scans_of(*frames).in_view(new_sight(CAMERA, np.eye(4)), REACH_M)
-    assert sorted(found[:, :3].tolist()) == [[1.0, 0.0, 5.0 + k] for k in range(2, FRAMES + 2)]
+    assert found[:, :3].tolist() == [[1.0, 0.0, 7.0]]
 
 
 def vertex(store: bs.Store, place: tuple[float, float, float], normal: tuple[float, float, float]) -> int:
@@ -262,7 +261,7 @@ def test_a_beam_through_a_railing_tells_what_is_behind_but_not_one_through_a_pan
     assert not store.attribute[wall, LOG_CLASS:].any(), "hidden, and nothing measured"
     store.attribute[bars, LOG_CLASS:] = -9.0
     store.attribute[bars, LOG_CLASS + railing] = 0.0
-    brush.scans.add(frame(np.array([[0.05, 0.05, 4.05]])))
+    brush.scans.take(frame(np.array([[0.05, 0.05, 4.05]])))
     mask = LateMask(brush.sight(image, np.eye(4)), scores)
     brush.refine(mask, brush.fuse(mask, 2), 2)
     assert (store.attribute[wall, LOG_CLASS:].argmax() == 1) == told
