@@ -163,10 +163,8 @@ def list_points(
             continue
         right = (C[0, 0] * x + C[0, 1] * y + C[0, 2] * z + C[0, 3]) / depth
         down = (C[1, 0] * x + C[1, 1] * y + C[1, 2] * z + C[1, 3]) / depth
-        if right * right + down * down > lens[11]:
-            continue
-        u, v = pixel_of(right, down, lens)
-        if not (u > -0.5 and v > -0.5 and u < lens[9] - 0.5 and v < lens[10] - 0.5):
+        u, v, shown = pixel_of(right, down, lens)
+        if not shown:
             continue
         row = min(max(int(v / size_px), 0), nearness.shape[0] - 1)
         column = min(max(int(u / size_px), 0), nearness.shape[1] - 1)

@@ -232,18 +232,15 @@ def project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> bo
     cy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
     nearness = 1.0 / z
     x, y = cx * nearness, cy * nearness
-    r2 = x * x + y * y
-    if r2 > lens[11]:
-        return False
-    u, v = pixel_of(x, y, lens)
-    if not (u > -0.5 and v > -0.5 and u < lens[9] - 0.5 and v < lens[10] - 0.5):
+    u, v, shown = pixel_of(x, y, lens)
+    if not shown:
         return False
     gx, gy, gz = np.float64(p[NORMAL]), np.float64(p[NORMAL + 1]), np.float64(p[NORMAL + 2])
     nx = T[0, 0] * gx + T[0, 1] * gy + T[0, 2] * gz
     ny = T[1, 0] * gx + T[1, 1] * gy + T[1, 2] * gz
     nz = T[2, 0] * gx + T[2, 1] * gy + T[2, 2] * gz
     facing = -(nx * x + ny * y + nz)
-    cosine = facing / math.sqrt(r2 + 1.0)
+    cosine = facing / math.sqrt(x * x + y * y + 1.0)
     seen.u[n], seen.v[n], seen.z[n] = u, v, z
     seen.cosine[n] = max(cosine, 0.0)
     # the inverse depth of a plane is linear in the image: n . ray / n . p
@@ -255,13 +252,14 @@ def project(p: F32, T: F64, lens: F64, reach_m: float, seen: Seen, n: int) -> bo
 
 
 @kernel
-def pixel_of(x: float, y: float, lens: F64) -> tuple[float, float]:
-    """Pixel of the sight line (x / z, y / z) through a ``Sight.lens``."""
+def pixel_of(x: float, y: float, lens: F64) -> tuple[float, float, bool]:
+    """Pixel of the sight line (x / z, y / z) through a ``Sight.lens``, and whether the image shows it."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
     u = lens[0] * (x * radial + 2.0 * lens[6] * x * y + lens[7] * (r2 + 2.0 * x * x)) + lens[2]
     v = lens[1] * (y * radial + lens[6] * (r2 + 2.0 * y * y) + 2.0 * lens[7] * x * y) + lens[3]
-    return u, v
+    inside = u > -0.5 and v > -0.5 and u < lens[9] - 0.5 and v < lens[10] - 0.5
+    return u, v, inside and r2 <= lens[11]
 
 
 @kernel
